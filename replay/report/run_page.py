@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shlex
 from collections.abc import Mapping, Sequence
@@ -11,25 +12,7 @@ import numpy as np
 
 from cdmisfa.core.signals import STATE_WORDS, STATES
 from replay.palette import shade
-from replay.report.figures import (
-    FRAME,
-    THUMBNAIL,
-    WEIGHTS,
-    bars,
-    colour_class,
-    data_uri,
-    frames_to_point_at,
-    numbers,
-    numbers_plot,
-    output_plot,
-    recent_plots,
-    reduced,
-    rule_plot,
-    saliency_image,
-    sheet,
-    timeline,
-    truth_plot,
-)
+from replay.report import figures
 from replay.report.run_data import ModuleData, RunData
 from replay.report.saving_rules import Measurement, attempts, measurements_of
 
@@ -57,13 +40,15 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         if event.text.startswith("ended: "):
             ended = event.text.removeprefix("ended: ")
     pointed = "timeline" if run.watched.columns else ""
-    attention_plot = timeline(outline, pointed) if outline.iterations else None
+    attention_plot = figures.timeline(outline, pointed) if outline.iterations else None
     if attention_plot is not None and pointed:
         t, values = run.watched.columns
         texts = _watched_texts(run, rules, t)
-        frames[pointed] = frames_to_point_at(
+        frames[pointed] = figures.frames_to_point_at(
             attention_plot, t, values, texts, images=run.spec.images
         )
+    attended = zip(outline.visits.tolist(), run.spec.streams, strict=True)
+    codes = np.unique(outline.changes[:, 2]).tolist()
     return {
         "kind": "run",
         "title": run.path.resolve().name,
@@ -72,18 +57,12 @@ def run_content(run: RunData, reproducible: str, again: str) -> dict[str, Any]:
         "outline": outline,
         "reproducible": reproducible,
         "ended": ended,
-        "attention": sorted(
-            zip(outline.visits.tolist(), run.spec.streams, strict=True), key=lambda row: -row[0]
-        ),
+        "attention": sorted(attended, key=lambda row: -row[0]),
         "cards": _cards(run),
         "open_cards": OPEN_CARDS,
         "timeline": attention_plot,
-        "states": [
-            (f"state{code}", STATE_WORDS[code])
-            for code in np.unique(outline.changes[:, 2]).tolist()
-            if code >= 0
-        ],
-        "rules": [(rule, rule_plot(outline, rule, pointed)) for rule in rules],
+        "states": [(f"state{code}", STATE_WORDS[code]) for code in codes if code >= 0],
+        "rules": [(rule, figures.rule_plot(outline, rule, pointed)) for rule in rules],
         "attempts": attempts(outline, rules),
         "modules": [_module(run, module, frames) for module in run.modules],
         "sections": SECTIONS,
@@ -127,11 +106,8 @@ def _watched_texts(run: RunData, rules: Sequence[Measurement], t: Any) -> list[s
 def _cards(run: RunData) -> list[dict[str, Any]]:
     """Return a card of each of the most watched streams; of many, those learned come first."""
     outline = run.outline
-    outcomes = {
-        outcome["stream"]: outcome
-        for outcome in run.result.get("streams", ())
-        if isinstance(outcome, Mapping) and "stream" in outcome
-    }
+    stated = [one for one in run.result.get("streams", ()) if isinstance(one, Mapping)]
+    outcomes = {one["stream"]: one for one in stated if "stream" in one}
     learned = {save.stream for save in outline.saved}
     streams = outline.streams(CARDS)
     if len(streams) > OPEN_CARDS:
@@ -142,24 +118,21 @@ def _cards(run: RunData) -> list[dict[str, Any]]:
         outcome = outcomes.get(name, {})
         state = STATES[code] if code >= 0 else "learned" if s in learned else ""
         words = STATE_WORDS[code] if code >= 0 else state or "not learned"
-        notes = [
-            f"module {save.module}, slowness {save.eta[0]:.4f} cycles/frame"
-            for save in outline.saved
-            if save.stream == s
-        ]
+        saves = [save for save in outline.saved if save.stream == s]
+        notes = [f"module {save.module}, slowness {save.eta[0]:.4f} cycles/frame" for save in saves]
         if not notes and outcome.get("module"):
             notes.append(f"module {outcome['module']}")
         if outcome.get("why"):
             notes.append(str(outcome["why"]))
         image, plot, last = "", None, run.last.get(s) if place < 2 * OPEN_CARDS else None
         if last is not None and run.spec.images:
-            image = data_uri(reduced(last, THUMBNAIL))
+            image = figures.data_uri(figures.reduced(last, figures.THUMBNAIL))
         elif last is not None:
-            plot = numbers_plot(last, f"Last {len(last)} frames of {name}")
+            plot = figures.numbers_plot(last, f"Last {len(last)} frames of {name}")
         cards.append(
             {
                 "name": name,
-                "colour": colour_class(s),
+                "colour": figures.colour_class(s),
                 "image": image,
                 "plot": plot,
                 "state": state,
@@ -178,22 +151,20 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
     save = next((save for save in outline.saved if save.module == frozen.index), None)
     saved = outline.end if save is None else save.t + outline.tau
     truth_fits = module.truth_fits()
+    others = [(module.correlation(m), m.frozen.index) for m in run.modules if m is not module]
     section: dict[str, Any] = {
         "frozen": frozen,
-        "colour": colour_class(frozen.stream_index),
+        "colour": figures.colour_class(frozen.stream_index),
         "saved": saved,
         "frames": module.stream.count,
         "fits": truth_fits,
         "overfitting": _overfitting(run, frozen.iteration),
-        "alike": max(
-            ((module.correlation(m), m.frozen.index) for m in run.modules if m is not module),
-            default=(0.0, 0),
-        ),
+        "alike": max(others, default=(0.0, 0)),
         "after": 0,
         "plot": None,
         "quantity": run.spec.truth[truth_fits[0].column] if truth_fits else "",
-        "truth": truth_plot(module, truth_fits[0]) if truth_fits else None,
-        "recent": recent_plots(module),
+        "truth": figures.truth_plot(module, truth_fits[0]) if truth_fits else None,
+        "recent": figures.recent_plots(module),
         "view": cli_command("view", run.path, "--at", f"iteration {frozen.iteration}"),
         **_weights(module, images=images),
         "extremes": [],
@@ -203,21 +174,18 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
     t, _, _ = module.outputs.columns
     section["after"] = min(int((t >= saved).sum()) * module.outputs.step, module.stream.count)
     key = f"module{frozen.index}"
-    section["plot"] = plot = output_plot(run, module, saved, key)
+    section["plot"] = plot = figures.output_plot(run, module, saved, key)
     if frozen.index <= SECTIONS:
         t, values, y = module.frames.columns
         texts = [f"frame {k:,}: output {v:+.2f}" for k, v in zip(t.tolist(), y, strict=True)]
-        frames[key] = frames_to_point_at(plot, t, values, texts, images=images)
+        frames[key] = figures.frames_to_point_at(plot, t, values, texts, images=images)
     for title, picks in module.stream.sheet().items():
         if picks:
-            small = [reduced(pick.frame, FRAME) for pick in picks] if images else []
-            section["extremes"].append(
-                {
-                    "title": title,
-                    "image": data_uri(sheet(small, len(small), 2)) if images else "",
-                    "picks": [(p.y, p.t, "" if images else numbers(p.frame)) for p in picks],
-                }
-            )
+            small = [figures.reduced(pick.frame, figures.FRAME) for pick in picks] if images else []
+            image = figures.data_uri(figures.sheet(small, len(small), 2)) if images else ""
+            texts = ["" if images else figures.numbers(pick.frame) for pick in picks]
+            rows = [(pick.y, pick.t, text) for pick, text in zip(picks, texts, strict=True)]
+            section["extremes"].append({"title": title, "image": image, "picks": rows})
     return section
 
 
@@ -238,12 +206,12 @@ def _weights(module: ModuleData, *, images: bool) -> dict[str, Any]:
         return {
             "bars": None,
             # Blue below 0, white at 0, orange above.
-            "weights": data_uri(shade(reduced(weights, WEIGHTS))),
-            "saliency": saliency_image(saliency, stream.mean) if stream.count else "",
+            "weights": figures.data_uri(shade(figures.reduced(weights, figures.WEIGHTS))),
+            "saliency": figures.saliency_image(saliency, stream.mean) if stream.count else "",
         }
     kind = "expanded inputs" if weights is None else "values of a frame"
     about = f"Weights of output 1 of module {frozen.index} on the {frozen.phi.shape[1]} {kind}"
-    return {"bars": bars(frozen.phi[0], about), "weights": "", "saliency": ""}
+    return {"bars": figures.bars(frozen.phi[0], about), "weights": "", "saliency": ""}
 
 
 def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
@@ -251,10 +219,8 @@ def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
     document, manifest = run.document, run.header.manifest
     source = document.get("source") or manifest.get("source")
     source = source if isinstance(source, Mapping) else {}
-    rows: list[tuple[str, Any]] = [
-        ("check", cli_command("check", run.path)),
-        ("learn again", again),
-    ]
+    check = cli_command("check", run.path)
+    rows: list[tuple[str, Any]] = [("check", check), ("learn again", again)]
     fork = manifest.get("fork")
     if isinstance(fork, Mapping):
         parent = os.path.normpath(run.path / str(fork.get("parent")))
@@ -264,13 +230,8 @@ def _origin(run: RunData, again: str) -> list[tuple[str, Any]]:
         ("seed", manifest.get("seed")),
         ("source", source.get("kind")),
     ]
-    files = [
-        file
-        for key in ("files", "views")
-        if isinstance(source.get(key), list)
-        for file in source[key]
-        if isinstance(file, Mapping)
-    ]
+    lists = [files for files in map(source.get, ("files", "views")) if isinstance(files, list)]
+    files = [file for file in itertools.chain(*lists) if isinstance(file, Mapping)]
     for file in files[:MOST_FILES]:
         digest = file.get("sha256") or file.get("sample_sha256")
         rows.append((str(file.get("file", file.get("name"))), digest and f"SHA-256 {digest}"))

@@ -77,16 +77,10 @@ def _paper_rules(outline: Outline) -> list[Measurement]:
     for rule in rules_of(header):
         values = np.abs(lines[rule.signal].reshape(outline.iterations, -1))
         below = rule.side == "below"
-        rules.append(
-            Measurement(
-                rule.symbol,
-                SIGNALS[rule.signal].about.rstrip("."),
-                values.max(axis=1) if below else values.min(axis=1),
-                low=None if below else rule.threshold,
-                high=rule.threshold if below else None,
-                log=rule.signal == "eta_dot",
-            )
-        )
+        worst = values.max(axis=1) if below else values.min(axis=1)
+        low, high = (None, rule.threshold) if below else (rule.threshold, None)
+        about, log = SIGNALS[rule.signal].about.rstrip("."), rule.signal == "eta_dot"
+        rules.append(Measurement(rule.symbol, about, worst, low, high, log))
     if (window := header.number("eta_dot_window")) is not None:
         # A module is saved only at the end of a novel block.
         blocks = np.where(lines["novel"] == 1, lines["novel_blocks"], np.nan)
@@ -130,18 +124,11 @@ def _progress_rules(outline: Outline) -> list[Measurement]:
          regret, None, IMPROVEMENT_ONGOING),
         ("tests", "Number of tested blocks", tests, window, None),
     ]  # fmt: skip
-    return [
-        Measurement(
-            name,
-            about,
-            np.where(was_tested, values, np.nan),
-            low,
-            high,
-            log=name in ("error", "change"),
-            exact=exact.get(name),
-        )
-        for name, about, values, low, high in rows
-    ]
+    rules = []
+    for name, about, values, low, high in rows:
+        values, log = np.where(was_tested, values, np.nan), name in ("error", "change")
+        rules.append(Measurement(name, about, values, low, high, log, exact.get(name)))
+    return rules
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,15 +171,11 @@ def attempts(outline: Outline, rules: list[Measurement]) -> list[Attempt]:
             blocks = outline.lines["module"] == module
             groups.append((f"module {module}", blocks, saves.get(module), -1))
     together = np.all([rule.holds for rule in deciding], axis=0)
-    return [
-        Attempt(
-            name,
-            int(blocks.sum()),
-            tuple(float(rule.holds[blocks].mean()) for rule in deciding),
-            int(together[blocks].sum()),
-            save,
-            STATE_WORDS[state] if state > 0 else "",
-        )
-        for name, blocks, save, state in groups
-        if blocks.any()
-    ]
+    made = []
+    for name, blocks, save, state in groups:
+        if blocks.any():
+            shares = tuple(float(rule.holds[blocks].mean()) for rule in deciding)
+            count, held = int(blocks.sum()), int(together[blocks].sum())
+            words = STATE_WORDS[state] if state > 0 else ""
+            made.append(Attempt(name, count, shares, held, save, words))
+    return made

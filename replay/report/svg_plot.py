@@ -159,13 +159,9 @@ class Plot:
         points = [f"{number(a)} {number(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True)]
         begins = np.diff(part, prepend=-1) != 0
         alone = begins & np.roll(begins, -1)  # a point between two gaps is a dot
-        self.path(
-            f"line {kind}",
-            (
-                ("M" if begins[i] else "L") + point + ("h0" if alone[i] else "")
-                for i, point in enumerate(points)
-            ),
-        )
+        for i, point in enumerate(points):
+            points[i] = ("M" if begins[i] else "L") + point + ("h0" if alone[i] else "")
+        self.path(f"line {kind}", points)
 
     def dots(self, kind: str, at: Any, values: Any) -> None:
         """Add a dot for each of (n,) values that is finite."""

@@ -164,13 +164,9 @@ def _write_run(recording: rr.RecordingStream, log: Path, every: int, tab: str | 
     view.finish(outline)
     text = drawable(summary_text(outline, log.resolve().parent.name, events))
     writer.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    has_scene, followed = isinstance(view.world, SceneView), view.modules.followed(outline)
     layout = run_layout(
-        outline,
-        writer,
-        has_scene=isinstance(view.world, SceneView),
-        followed=view.modules.followed(outline),
-        sheets=view.modules.sheets,
-        tab=tab,
+        outline, writer, has_scene=has_scene, followed=followed, sheets=view.modules.sheets, tab=tab
     )
     recording.send_blueprint(layout)
 
@@ -187,9 +183,8 @@ def _write_recording(
     with contextlib.closing(open_for_viewing(paths, inputs)) as source:
         about(source)
         first, count, spec = source.t, source.frames, source.spec
-        ours = source.recorded
         files = [view.path for stream in source.streams for view in stream.views]
-        scenery = scenery_of_recording(files) if ours else None
+        scenery = scenery_of_recording(files) if source.recorded else None
         writer = Writer(recording, spec)
         world = None if scenery is None else SceneView(writer, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):

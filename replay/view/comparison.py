@@ -84,10 +84,8 @@ def _write_curves(
     for signal in CURVES:
         values = signals[signal].astype(np.float64).reshape(len(signals), -1)
         values = power_of_ten(values) if signal == "eta_dot" else values
-        count = values.shape[1]
-        writer.lines(
-            f"{root}/{signal}", [name] * count, signals.times(), values, [colour(number)] * count
-        )
+        names, rgbs = [name] * values.shape[1], [colour(number)] * values.shape[1]
+        writer.lines(f"{root}/{signal}", names, signals.times(), values, rgbs)
     for s in selected:
         watched = np.flatnonzero(signals["stream"] == s)
         if len(watched):
@@ -114,10 +112,8 @@ def _layout(
     table = rrb.TextDocumentView(origin="/summary", name="Runs")
     grid = rrb.Grid(*panels(CURVES), grid_columns=2)
     tabs = [rrb.Vertical(table, grid, row_shares=[1, 3], name="Overview")]
-    names, selected = outline.names(), outline.streams(MOST_STREAMS)
-    errors = {
-        f"{ERROR}/{part(names, s)}": f"Learning error of {drawable(names[s])}" for s in selected
-    }
+    names, shown = outline.names(), outline.streams(MOST_STREAMS)
+    errors = {f"{ERROR}/{part(names, s)}": f"Learning error of {drawable(names[s])}" for s in shown}
     if views := panels(errors):
         tabs.append(rrb.Vertical(*views, name="Streams"))
     return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)

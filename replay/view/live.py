@@ -77,13 +77,10 @@ class LiveView(Sink):
         self.address = str(sink.uri)
         self._recording.send_recording_name("live")
         self._writer = writer = Writer(self._recording, spec)
-        writer.log(
-            "summary", rr.TextDocument("The run has not finished: results follow at its end.")
-        )
-        streams = empty.streams(MOST_STREAMS)
-        self._view = RunView(
-            writer, header, streams, run or Path(), every=EVERY_FRAMES, piece=PIECE
-        )
+        text = "The run has not finished: results follow at its end."
+        writer.log("summary", rr.TextDocument(text))
+        shown = empty.streams(MOST_STREAMS)
+        self._view = RunView(writer, header, shown, run or Path(), every=EVERY_FRAMES, piece=PIECE)
         has_scene = isinstance(self._view.world, SceneView)
         self._recording.send_blueprint(run_layout(empty, has_scene=has_scene))
         self._images = spec.images

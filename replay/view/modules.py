@@ -73,8 +73,7 @@ def write_weights(writer: Writer, path: str, t: int, iteration: int, phi: FloatA
     """
     shape = writer.spec.frame_shape
     if not writer.spec.images or phi.shape[1] != shape[0] * shape[1]:
-        bars = rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
-        writer.log_at(path, t, iteration, bars)
+        writer.log_at(path, t, iteration, rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST)))
         return
     for j, weights in enumerate(phi):
         place = path if len(phi) == 1 else f"{path}/{j + 1}"
@@ -185,9 +184,7 @@ class ModulesView:
         for number, stream in self._known.items():
             module, place = stream.module, f"modules/{number}"
             slow = module.slow.astype(bool).tolist()
-            labels = [
-                f"{j} {'slow' if is_slow else 'not slow'}" for j, is_slow in enumerate(slow, 1)
-            ]
+            labels = [f"{j} {'slow' if one else 'not slow'}" for j, one in enumerate(slow, 1)]
             rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in slow]
             labels = labels or _numbers(module.phi)
             hang_weights(self._writer, f"{place}/weights", labels, rgbs)
@@ -270,9 +267,8 @@ class ModulesView:
         height, width = self._writer.spec.frame_shape
         gap = np.full((height, BETWEEN), DARK[0], dtype=np.uint8)
         corners = grid_positions(len(sheet), *sheet_size(height, width), columns=1)
-        for number, ((name, picks), corner) in enumerate(
-            zip(sheet.items(), corners, strict=True), 1
-        ):
+        hung = zip(sheet.items(), corners, strict=True)
+        for number, ((name, picks), corner) in enumerate(hung, 1):
             if picks:
                 path = f"{place}/sheet/{number}_{name}"
                 strip = np.hstack([part for pick in picks for part in (pick.frame, gap)])

@@ -118,8 +118,9 @@ class Inputs:
         self._writer, self._spec, self._named = writer, writer.spec, -1
         if self._spec.images:
             height, width = self._spec.frame_shape
-            frame = rr.Boxes2D(mins=[[0, 0]], sizes=[[width, height]], show_labels=True)
-            writer.log(WATCHED_NAME, frame)
+            writer.log(
+                WATCHED_NAME, rr.Boxes2D(mins=[[0, 0]], sizes=[[width, height]], show_labels=True)
+            )
 
     def take(self, batch: Batch) -> None:
         """Write the messages of some iterations."""

@@ -109,11 +109,8 @@ class RunLayout:
 
     def _views(self, panel: Panel) -> Views:
         """Return the views of a panel: none, one, or one for each module."""
-        when = {
-            "bands": not self._header.clusters,
-            "clusters": self._header.clusters,
-            "outputs": self._outline.outputs > 1,
-        }
+        clusters, several = self._header.clusters, self._outline.outputs > 1
+        when = {"bands": not clusters, "clusters": clusters, "outputs": several}
         if not when.get(panel.when, True):
             return []
         title = panel.title.format(i="{i}", **self._facts)
@@ -144,14 +141,9 @@ class RunLayout:
         """Return the curves of a panel, with a legend where they are several."""
         several = len(entities) > 1 or "*" in entities[0] or self._outline.outputs > 1
         several |= entities[0] in ("/decision/attention", "/world/truth")
-        return curve_view(
-            title,
-            entities,
-            self._end,
-            recent=RECENT if panel.kind == "recent" else 0,
-            span=self._span(panel, entities),
-            legend=panel.legend and several,
-        )
+        recent, span = RECENT if panel.kind == "recent" else 0, self._span(panel, entities)
+        legend = panel.legend and several
+        return curve_view(title, entities, self._end, recent=recent, span=span, legend=legend)
 
     def _span(self, panel: Panel, entities: Sequence[str]) -> Interval | None:
         """Return the range of a panel's axis; None leaves it to the viewer."""
@@ -202,9 +194,8 @@ class RunLayout:
         if has_sheet:
             title = "Frames with the least, middle and greatest output 1"
             width, height = sheet_size(*self._spec.frame_shape)
-            left.append(
-                images(f"/modules/{i}/sheet", title, grid_bounds(3, height, width, columns=1))
-            )
+            bounds = grid_bounds(3, height, width, columns=1)
+            left.append(images(f"/modules/{i}/sheet", title, bounds))
         for save in (save for save in self._outline.saved if save.module == i):
             name += f": {drawable(self._spec.streams[save.stream])}"
             blocks, saved = self._outline.blocks, save.t + self._outline.tau
@@ -253,6 +244,5 @@ class RunLayout:
         if not self._spec.images:
             hidden = rrb.PlotLegend(visible=False)
             return rrb.BarChartView(origin=path, name=name, plot_legend=hidden)
-        return images(
-            path, name, grid_bounds(outputs, *self._spec.frame_shape) if outputs > 1 else None
-        )
+        bounds = grid_bounds(outputs, *self._spec.frame_shape) if outputs > 1 else None
+        return images(path, name, bounds)

@@ -93,8 +93,7 @@ class StateTimelines:
         """Write the states of some iterations."""
         for codes, timeline in self._timelines:
             for columns in batch.signals:
-                at = columns.frames, columns.iterations
-                timeline.add_codes(*at, codes(columns), columns.tau)
+                timeline.add_codes(columns.frames, columns.iterations, codes(columns), columns.tau)
             timeline.send_changes()
 
     def _states(self, s: int, columns: SignalColumns) -> IntArray:

@@ -14,10 +14,8 @@ from replay.view.writer import MOST_STREAMS
 ENDED = "ended:"
 
 # Settings that the summary names, by learner.
-SETTINGS = {
-    "paper": ("nu", "tau", "sigma", "delta"),
-    "progress": ("tau", "components", "window", "attention"),
-}
+PAPER_SETTINGS = ("nu", "tau", "sigma", "delta")
+PROGRESS_SETTINGS = ("tau", "components", "window", "attention")
 
 # Most streams that are listed by name.
 NAMED = 4
@@ -50,13 +48,10 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
         )
         lines += text_table(("stream", "attended"), shares)
     settings = [("seed", header.manifest.get("seed"))]
-    keys = SETTINGS["progress" if by_progress else "paper"]
+    keys = PROGRESS_SETTINGS if by_progress else PAPER_SETTINGS
     settings += [(key, header.setting("learner", key)) for key in keys]
-    lines += [
-        "Settings: " + ", ".join(f"{key} {value}" for key, value in settings if value is not None),
-        "",
-    ]
-    return "\n".join(lines)
+    stated = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
+    return "\n".join([*lines, f"Settings: {stated}", ""])
 
 
 def _of_modules(outline: Outline) -> list[str]:
@@ -101,9 +96,8 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
 
 def policy_text(policy: Sequence[int], streams: Sequence[str]) -> str:
     """Return a policy as text, as "stay on x1" or "stay on 40 of 78 streams"."""
-    stays = [
-        s for s, action in zip(streams, policy, strict=True) if action == ACTIONS.index("stay")
-    ]
+    stay = ACTIONS.index("stay")
+    stays = [s for s, action in zip(streams, policy, strict=True) if action == stay]
     if len(stays) == len(streams):
         return "stay on every stream"
     if len(stays) > NAMED:
