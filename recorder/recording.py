@@ -123,8 +123,10 @@ def record(
         raise UsageError(f"--frames is {frames}: record at least one{limit}")
     if not resume:
         refuse_existing(folder, force=force)
-    elif force or not holds_recording(folder):
-        raise UsageError(f"{folder} has no recording to resume, or --force is given as well")
+    elif force:
+        raise UsageError("--resume continues what exists: leave out --force")
+    elif not holds_recording(folder):
+        raise UsageError(f"{folder} has no recording to resume: leave out --resume to start one")
     recording = recording_spec(source, settings, scene)
     streams = recording.spec.streams
     if unknown := [view for view in views or () if view not in streams]:
