@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import math
 import re
 import struct
@@ -203,11 +204,15 @@ class BlockSignals:
 DENSE_STREAMS = 64
 
 
+# Description of each field, empty under python -OO. The indentation of a docstring depends on the
+# version of Python; `getdoc` removes it.
+_ABOUT = dict(re.findall(r"(?m)^    (\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(BlockSignals) or ""))
+
+
 def _described(field: dataclasses.Field[Any]) -> Signal:
     dtype = _DTYPES[str(field.type)]
     show = field.metadata["show"] or ("line" if dtype == "float64" else "lane")
-    found = re.search(rf"\n +{field.name}: (.+(?:\n {{12}}.+)*)", BlockSignals.__doc__ or "")
-    about = " ".join(found[1].split()) if found else ""  # python -OO removes the text
+    about = " ".join(_ABOUT.get(field.name, "").split())
     return Signal(name=field.name, dtype=dtype, about=about, **{**field.metadata, "show": show})
 
 
