@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import pytest
 from conftest import Cdmisfa
+from waiting import python
 
 from cdmisfa.cli import options
 from cdmisfa.cli.app import COMMANDS, cli
@@ -66,6 +67,11 @@ def test_help_ends_with_three_examples_that_the_command_takes(cdmisfa: Cdmisfa, 
             assert isinstance(value, str | list | tuple) or not param.required, example
             if isinstance(value, str | list):
                 param.type_cast_value(context, value)
+
+
+def test_help_needs_no_docstrings() -> None:
+    done = python("-OO", "-m", "cdmisfa", "learn", "--help")
+    assert (done.returncode, done.stderr, "--seed N" in done.stdout) == (0, "", True)
 
 
 def test_help_says_what_each_argument_may_be(cdmisfa: Cdmisfa) -> None:

@@ -48,15 +48,15 @@ class Command(click.Command):
         examples: the example commands.
     """
 
-    def __init__(self, name: str | None, *, help: str, **settings: Any) -> None:
-        text, _, examples = inspect.cleandoc(help).partition(EXAMPLES)
+    def __init__(self, name: str | None, *, help: str | None, **settings: Any) -> None:
+        # python -OO removes docstrings: help is None then, and the page has only names
+        text, _, examples = inspect.cleandoc(help or "").partition(EXAMPLES)
         text, _, entries = text.partition(OPTIONS)
         for spec, about in re.findall(r"^ {4}(--\S+).*?: (.*(?:\n {8}.*)*)", entries, re.MULTILINE):
             option = next(param for param in settings["params"] if spec in param.opts)
             option.help = " ".join(about.split())
         self.examples = [line.strip() for line in examples.splitlines()]
-        lines = "".join(f"  {line}\n" for line in self.examples)
-        super().__init__(name, help=laid_out(text), epilog=f"\b\nExamples:\n{lines}", **settings)
+        super().__init__(name, help=laid_out(text), **settings)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples below a heading like that of the options."""
