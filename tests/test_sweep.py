@@ -285,4 +285,4 @@ def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> Non
     assert (second["iterations_sd"], second["eta_1_mean"]) == ("", "")
     document = json.loads(shown("--json"))
     assert document["points"][1]["measures"]["iterations"] == {"mean": 5.0, "sd": None, "n": 1}
-    assert "20 ± 10" in shown()
+    assert "20 ± 10" in shown() == shown("--quiet")

@@ -145,7 +145,7 @@ def parse_seeds(text: str) -> list[int]:
 
 def _folder_of_sweep(ctx: click.Context) -> Path:
     """Return the folder that `--summary` takes; raise an error for other arguments and options."""
-    applies = ("source", "summary", "csv", "as_json")
+    applies = ("source", "summary", "csv", "as_json", "quiet")
     for param in ctx.command.params:
         name = param.name or ""
         if name not in applies and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
