@@ -66,6 +66,9 @@ CASES: dict[str, tuple[str, ...]] = {
     "sweep taken RUN --summary": ("--summary takes the folder of one sweep",),
     "sweep taken --summary --csv --json": ("choose one of --csv and --json",),
     "sweep taken --summary": ("taken is not a sweep",),
+    # an error names the largest value of an option
+    "learn oscillatory --seed 9223372036854775808": ("from 0 to 9223372036854775807",),
+    "convert left.mcap --rate 1e7 -o x": ("from 0.001 to 1000000",),
     "doctor left.mcap": ("check files with cdmisfa verify left.mcap",),
     # a fork that cannot be
     "fork RUN --iteration 3 -o x --set learner.tau=20": ("learner.tau cannot change in a fork",),

@@ -107,7 +107,7 @@ class Number(click.ParamType[Any]):
             number = math.nan
         if not self.low <= number <= self.high:
             least = f"of at least {self.low:g}"
-            limits = least if self.high > 1e9 else f"from {self.low:g} to {self.high:.9g}"
+            limits = least if self.high == math.inf else f"from {self.low:g} to {self.high}"
             kind = "whole number" if self.kind is int else "number"
             self.fail(f"{value} is wrong: give a {kind} {limits}", param, ctx)
         return number
@@ -162,7 +162,7 @@ INPUTS: dict[str, Decorator] = {
     "rate": option(
         "--rate HZ",
         "Frames per second. [default: rate of the first stream]",
-        type=Number(1e-3, 1e6, float),
+        type=Number(1e-3, 1_000_000, float),
     ),
     "start": option(
         "--start TIME",
