@@ -122,7 +122,8 @@ def option(spec: str, help: str = "", *, name: str | None = None, **about: Any) 
     """Return an option of a command.
 
     Args:
-        spec: its name and the word for its value, as "--frames N"; without a word it is a flag.
+        spec: its name and the word for its value, as "--frames N"; without a word and without
+            a `type` it is a flag.
         help: its help text; by default that below "Options:" in the docstring of the command.
         name: name of the parameter, if it is not that of the option.
         about: see `click.option`; the type of a value N is by default a whole number from 1.
@@ -234,7 +235,7 @@ def inputs(*names: str) -> Decorator:
 
 
 def settings(
-    help: str = "Set a key of docs/reference/configuration.md, as learner.nu=0.02. Repeatable.",
+    help: str = "Set a key of docs/reference/configuration.md, such as learner.tau=20. Repeatable.",
 ) -> Decorator:
     """Return the option `--set`."""
     return click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help=help)

@@ -30,7 +30,7 @@ WHITE_NOISE_SLOWNESS = math.sqrt(2.0) / (2.0 * math.pi)
 MIN_SPECTRUM = 4
 
 # Learning errors that a candidate stores, in blocks: the last 30 are compared with the 60 before
-# (`NO_PROGRESS` in `decisions.py`). Set by hand; each error takes 8 bytes in every stored state.
+# (`STALLED_BLOCKS` in `decisions.py`). Set by hand; each error takes 8 bytes in every stored state.
 ERROR_HISTORY = 90
 
 # Largest number of candidates in memory, and largest total size in bytes (decision 0029). Beyond
