@@ -96,7 +96,7 @@ def test_a_share_of_what_is_learned_from_once_is_held_out(
     done = cdmisfa("learn", log, *said, "--json", "--max-iterations", "3", *options)
     assert done.json["source"].get("held_out", 0) == held
     assert ("held_out" in done.json) == (held > 0)
-    few = "too short to test on unseen frames (150 of 1500 frames would be held out)"
+    few = "150 of 1500 frames are too few to test on: none are held out (input.holdout)"
     assert (few in done.err) == ("15" in options)
 
 

@@ -334,7 +334,8 @@ class TestWithoutItsSource:
     def test_a_run_that_does_not_say(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
         go(OscillatorySource(), tmp_path / "run", 3)
         refused = cdmisfa("learn", "--resume", "-o", tmp_path / "run")
-        assert (refused.code, "does not state its source" in refused.err) == (2, True)
+        assert (refused.code, "does not state its source: name the" in refused.err) == (2, True)
+        assert "--source" not in refused.err
         assert cdmisfa("learn", "--resume", "-o", tmp_path / "none").code == 2
 
 

@@ -60,8 +60,8 @@ def hold_out(source: FrameSource, configuration: Configuration) -> None:
     if count >= MIN_HELD_OUT:
         source.hold_out(count)
     else:
-        part = f"{count} of {source.frames} frames would be held out"
-        source.notes = (*source.notes, f"too short to test on unseen frames ({part})")
+        few = f"{count} of {source.frames} frames are too few to test on"
+        source.notes = (*source.notes, f"{few}: none are held out (input.holdout)")
 
 
 def evaluate(

@@ -87,7 +87,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """
     command = read_header(log_to_resume(run)).manifest.get(COMMAND)
     if not isinstance(command, Mapping) or not isinstance(command.get("source"), list):
-        raise UsageError(f"{run} does not state its source: name it with --source")
+        raise UsageError(f"{run} does not state its source: name the source")
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in command.items()
