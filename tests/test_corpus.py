@@ -193,7 +193,9 @@ class TestSummary:
         shutil.copytree(corpus / "night" / "one", corpus / "night" / "two")
         done = cdmisfa("index", corpus)
         assert done.code == 0
-        assert "recording  3" in done.out  # the torn one is the third
+        assert "recording     3" in done.out  # the torn one is the third
+        assert "external log  3" in done.out  # named as by info
+        assert "robot.mcap: external log, " in cdmisfa("info", corpus / "robot.mcap").out
         assert "text.mcap: not an MCAP file" in done.out
         document = cdmisfa("index", corpus, "--json").json
         assert document["broken"] == len(document["problems"]) == 3

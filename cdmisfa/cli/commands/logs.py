@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 # Largest number of streams of a run that `info` names, to keep them on one line.
 MOST_STREAMS = 8
 
+# Words for kinds of logs, where they differ from the kinds that --json and the index have.
+KIND_WORDS = {"foreign": "external log"}
+
 
 @options.command("info")
 @click.argument("path", nargs=-1, required=True, type=options.WORD)
@@ -33,7 +36,8 @@ def info_command(path: tuple[str, ...], as_json: bool) -> int:
 
     The command prints topics, times and sizes, and for a run its modules and the result of each
     stream. The exit code is 2 if a path is no log, and 3 if a log is damaged or cut short (3
-    wins). Contents that only cdmisfa verify reads are called unchecked.
+    wins). Contents that only cdmisfa verify reads are reported as not
+    checked.
 
     PATH is one of:
         {run}
@@ -65,7 +69,7 @@ def _print_info(info: LogReport) -> None:
         if part.state != "not read":
             state = part.state.replace("unchecked", "contents not checked")
             crc = f"checksums {part.crc}".replace("checksums absent", "no checksums")
-            words = [part.kind.replace("foreign", "external log"), state, crc]
+            words = [KIND_WORDS.get(part.kind, part.kind), state, crc]
             words += [] if part.seed is None else [f"seed {part.seed}"]
         printing.line(f"{part.path}: {', '.join(words)}")
     for line in (*(f"{p.where}: {p.what}" for p in info.problems), *info.notes):
@@ -347,10 +351,9 @@ def _print_index(indexed: Indexed) -> None:
     )
     if indexed.kinds:
         head = "kind", "logs", "files", "streams", "length", "size"
-        kinds = [row["kind"].replace("foreign", "external") for row in indexed.kinds]
-        counts = [[row[name] for name in head[1:4]] for row in indexed.kinds]
+        cells = [[KIND_WORDS.get(row[key], row[key]) for key in head[:4]] for row in indexed.kinds]
         sizes = [[duration_text(row["seconds"]), decimal(row["bytes"])] for row in indexed.kinds]
-        printing.table(head, [[k, *a, *b] for k, a, b in zip(kinds, counts, sizes, strict=True)])
+        printing.table(head, [[*a, *b] for a, b in zip(cells, sizes, strict=True)])
     for row in indexed.problems:
         printing.line(f"{row['path']}: {row['problem']}")
     if (more := indexed.broken - len(indexed.problems)) > 0:
