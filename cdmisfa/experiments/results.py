@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.experiments.store import DONE, FAILED, ROWS, read_trial_rows
-from replay.runs.folders import REQUEST, read_request
+from replay.runs.folders import read_request
 
 # 95 % quantile of the chi-square distribution with one degree of freedom.
 CHI_SQUARE_95 = 3.841458820694124
@@ -190,8 +190,6 @@ def results(folder: str | Path) -> list[PointResult]:
         LogDamagedError: its files are damaged.
     """
     folder = Path(folder)
-    if not (folder / REQUEST).exists():
-        raise UsageError(f"{folder} is not a sweep: name a folder that cdmisfa sweep -o wrote")
     trials = read_request(folder)
     rows = {row["id"]: row for row in read_trial_rows(folder)}
     points: dict[str, tuple[dict[str, Any], list[Any]]] = {}

@@ -89,10 +89,12 @@ def read_request(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     """Return id and point of the trials that a sweep was last asked for, in the order of its grid.
 
     Raises:
-        UsageError: the file does not exist, or is too large.
+        UsageError: the folder is not a sweep, or the file is too large.
         LogDamagedError: it is damaged, or cannot be read.
     """
     path, remedy = folder / REQUEST, "run the sweep again to write it"
+    if not path.exists():
+        raise UsageError(f"{folder} is not a sweep: name a folder that cdmisfa sweep -o wrote")
     request = read_json(path, remedy, limit=MAX_LIST)
     try:
         return [(str(trial["id"]), dict(trial["point"])) for trial in request["trials"]]
