@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.features.outputs import slowness_by_moments
-from cdmisfa.features.recursive import RecursiveFeature
+from cdmisfa.features.recursive import STORED_PER_COMPONENT, RecursiveFeature
 
 # Frames (n, I) in their order, and whether frames are missing before them.
 Pieces = Iterable[tuple[NDArray[Any], bool]]
 
 # Directions that are stored while frames are read, as a multiple of the components. Set by hand: a
 # larger factor approaches exact batch SFA, and takes more time and memory.
-STORED_PER_COMPONENT = 8
+BATCH_STORED_PER_COMPONENT = 8
 
 # Share of the largest variance below which a direction holds rounding noise; as in `batch_sfa`.
 TOLERANCE = 1e-10
@@ -45,7 +45,7 @@ def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) ->
     """Return the slowest outputs within the leading principal components of frames.
 
     All frames have equal weights. The result is close to that of `batch_sfa` on the components, but
-    not equal, because only `STORED_PER_COMPONENT` directions a component are stored.
+    not equal, because only `BATCH_STORED_PER_COMPONENT` directions a component are stored.
 
     Args:
         pieces: at least one piece of uint8 pixels, which count 1/255 each, or float64 values.
@@ -53,9 +53,10 @@ def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) ->
         components: number of components K.
         outputs: number of outputs J.
     """
+    # A RecursiveFeature stores STORED_PER_COMPONENT directions for each of its components.
+    size = BATCH_STORED_PER_COMPONENT * components // STORED_PER_COMPONENT
     sfa: RecursiveFeature | None = None
     for x, gap in pieces:
-        size = STORED_PER_COMPONENT * components // 2
         sfa = sfa or RecursiveFeature(x.shape[1], size, window=frames)
         sfa.update(x, gap)
     assert sfa is not None

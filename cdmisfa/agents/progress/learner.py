@@ -26,6 +26,7 @@ from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.outcomes import NO_PROGRESS, outcome_text
 from cdmisfa.core.signals import STATES, BlockSignals
+from cdmisfa.features.recursive import STORED_PER_COMPONENT
 from cdmisfa.modules import Module
 
 # Smallest test window in blocks, also if `learner.test_frames` holds fewer. Set by hand: the change
@@ -81,7 +82,7 @@ class ProgressLearner:
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
         self._streams = decisions.new_streams(len(spec.streams))
-        size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
+        size = 8 * self._n_inputs * (STORED_PER_COMPONENT * config.components + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
         self.rule = RULES[config.attention]
         self._stack_modules()

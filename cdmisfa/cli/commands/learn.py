@@ -159,6 +159,7 @@ def _opened_source(
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Open a source, with the arguments of `open_source`; print its notes and warnings."""
     from cdmisfa.experiments.holdout import hold_out
+    from cdmisfa.experiments.run_folder import OPENING
     from cdmisfa.experiments.sources import is_scene, open_source
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
@@ -168,8 +169,7 @@ def _opened_source(
         raise UsageError(f"{words[0]} is a live stream: --resume needs a source that can go back")
     if record_to is not None and not live:
         raise UsageError(f"{words[0]} is no live stream: {are_for(['--record'], 'live streams')}")
-    flags = ("--loop", "--skip-damaged", "--episodes")
-    unused = [flag for flag in flags if arguments[flag.removeprefix("--").replace("-", "_")]]
+    unused = [f"--{name.replace('_', '-')}" for name in OPENING if arguments[name]]
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (output, record_to) if live else ()):
