@@ -267,8 +267,8 @@ class Session:
         with contextlib.ExitStack() as stack:
             if self.folder is not None:
                 options = {"force": self._force, "resumed": self._resumed}
-                run_log = opened_log(self.folder, self.source, self.manifest, **options)
-                log = stack.enter_context(run_log)
+                opened = opened_log(self.folder, self.source, self.manifest, **options)
+                log = stack.enter_context(opened)
                 state = Keyframes(log, self.source, self.learner, self._versions, keyframes)
                 all_sinks += [log, state]
             if live is not None:
@@ -287,8 +287,7 @@ class Session:
             result = self._result(ended, digest.hexdigest(), stop)
             if log is not None:
                 manifest = {**self.manifest, "versions": self._versions}
-                view_too = rerun and result.ended != INTERRUPTED
-                write_results(log, result, manifest, view=view_too)
+                write_results(log, result, manifest, view=rerun and result.ended != INTERRUPTED)
         return result
 
     def _result(self, ended: str, sha256: str, stop: Callable[[], bool]) -> RunResult:
