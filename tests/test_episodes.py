@@ -154,6 +154,7 @@ def test_bad_logs_are_left_out_and_said_and_the_rest_is_learned(
     for name in ("large.mcap", "table.csv", "gone.mcap", "text.mcap"):
         assert f"{name}" in done.err
     assert done.err.count("skipped") == 4
+    assert done.err.count("--size and --rate make logs alike") == 1
     assert "Traceback" not in done.err
 
 

@@ -72,6 +72,12 @@ class TestArrays(ForwardContract):
         return ArraySource({"array": frames, "iterator": (255 - frame for frame in frames)})
 
 
+def test_numbers_that_are_not_finite_are_refused_with_their_frame() -> None:
+    source = ArraySource({"numbers": iter([np.zeros(2), np.array([0.0, np.nan])])})
+    with pytest.raises(UsageError, match="frame 1 of numbers has NaN or infinity"):
+        source.take(0, 2)
+
+
 def test_a_task_shows_its_observations_and_actions_as_truth() -> None:
     with GymSource(["CartPole-v1"], size=(24, 32)) as source:
         observed = [f"CartPole_v1_{i}" for i in range(4)]
@@ -247,6 +253,9 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
 
 REFUSED = {
     "learn av:nothing.mkv": "av:nothing.mkv cannot be opened",
+    "learn camera:/dev/nothing": "/dev/nothing: this device does not exist",
+    f"record {TEST} -o x --field z": "has images: --field is for logs and foxglove:// streams",
+    "learn gym:CartPole-v1 --set input.range=0,1": "input.range is for logs and foxglove://",
     "record rtsp://me:secret@127.0.0.1:9/x -o x": "rtsp://127.0.0.1:9/x cannot",
     "record gym:Nothing-v0 -o x": "gym:Nothing-v0 cannot be created",
     f"convert {TEST} -o x": "is a live stream: record it with cdmisfa record",

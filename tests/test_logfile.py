@@ -11,7 +11,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.log.files import partial_path
+from recorder.log.files import locked_folder, partial_path, refuse_taken
 from recorder.log.logfile import LogFile
 
 SECOND = 1_000_000_000
@@ -150,3 +150,10 @@ def test_a_full_disk_is_an_error_and_not_a_loss(tmp_path, monkeypatch):
         log.add_metadata("m", {"a": "b"})
     log.abandon()
     assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_folder_that_cannot_be_locked_or_replaced_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="missing cannot be opened as a folder: No such"):
+        locked_folder(tmp_path / "missing").__enter__()
+    with pytest.raises(UsageError, match=r"is a folder: choose another name$"):
+        refuse_taken(tmp_path, force=False)

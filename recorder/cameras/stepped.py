@@ -110,13 +110,13 @@ def _checked(spec: SourceSpec, rows: Iterable[Sequence[NDArray[Any]]]) -> Iterat
     for t, row in enumerate(rows):
         for name, frame in zip(spec.streams, row, strict=True):
             alike = frame.shape == spec.frame_shape and str(frame.dtype) == spec.dtype
-            plain = (spec.dtype, frame.ndim) in (("uint8", 2), ("float64", 1))
-            if not alike or not plain or not np.isfinite(frame).all():
+            if not alike or (spec.dtype, frame.ndim) not in (("uint8", 2), ("float64", 1)):
                 raise UsageError(
                     f"frame {t} of {name} is {frame.dtype} {frame.shape}: give frames (height, "
-                    "width) of uint8 or (I,) of finite float64, with one shape and type for all "
-                    "streams"
+                    "width) of uint8 or (I,) of float64, with one shape and type for all streams"
                 )
+            if frame.ndim == 1 and not np.isfinite(frame).all():
+                raise UsageError(f"frame {t} of {name} has NaN or infinity: fill it in or omit it")
         yield row, np.empty(0)
 
 

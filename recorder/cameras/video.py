@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import CdmisfaError, one_line
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.cameras.live import Steady
 from recorder.images.options import VIDEO_RECIPE
@@ -57,6 +57,8 @@ class VideoCamera:
         head, _, rest = word.partition(":")
         form, _, address = rest.partition(":")
         if head == "camera":
+            if not Path(rest).exists():
+                raise UsageError(f"{rest}: this device does not exist")
             self._form, self._address = "v4l2" if rest.startswith("/dev/video") else None, rest
         elif head == "av":
             stated = address and not address.startswith("//") and form in self._av.formats_available

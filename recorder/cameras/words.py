@@ -44,7 +44,7 @@ def open_live(
         say: called with a line when the state of a camera changes.
 
     Raises:
-        UsageError: a word does not name a live stream, an option is for logs, a package is
+        UsageError: a word does not name a live stream, an option is for other sources, a package is
             missing, or a camera cannot be opened.
     """
     from recorder.cameras.live import LiveSource
@@ -57,11 +57,13 @@ def open_live(
         )
     of_logs = options.named(("topics", "start", "end", "align", "centre", "holdout"))
     of_logs += ["--color auto"] if options.color == "auto" else []
-    schemes = [word.partition(":")[0].lower() for word in words]
-    if "foxglove" not in schemes:
-        of_logs += options.named(("fields", "range"))
     if of_logs:
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
+    schemes = [word.partition(":")[0].lower() for word in words]
+    of_messages = options.named(("fields", "range"))
+    if of_messages and "foxglove" not in schemes:
+        refusal = are_for(of_messages, "logs and foxglove:// streams")
+        raise UsageError(f"{words[0]} has images: {refusal}")
     names = live_names(words)
     color = options.color is True
     if "gym" in schemes:

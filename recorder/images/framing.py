@@ -167,7 +167,8 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
     inner = _largest_within(size, whole) if fit == "pad" else size
     if not enlarge and (image.shape[0] < inner[0] or image.shape[1] < inner[1]):
         raise UsageError(
-            f"an image of {_size_text(whole)} is smaller than {_size_text(size)}: reduce --size"
+            f"an image of {_size_text(whole)} is smaller than {_size_text(size)}: use larger "
+            "images, or learn from smaller frames with --size"
         )
     frame = np.zeros(size, np.uint8)
     _middle(frame, inner)[:] = shrink(image, *inner)

@@ -52,8 +52,8 @@ def refuse_taken(path: Path, *, force: bool) -> None:
     """Check that a file can be written: nothing is there or, with `force`, a file."""
     refuse_special(path)
     if path.is_dir() or (path.exists() and not force):
-        problem = "is a folder" if path.is_dir() else "exists"
-        raise UsageError(f"{path} {problem}: choose another name, or overwrite it with --force")
+        problem = "is a folder:" if path.is_dir() else "exists: overwrite it with --force, or"
+        raise UsageError(f"{path} {problem} choose another name")
 
 
 def refuse_unless(path: Path, fact: str, *endings: str) -> None:
@@ -200,9 +200,12 @@ def locked_folder(folder: Path) -> Iterator[None]:
     """Lock a folder against other processes that use this function; a kill releases the lock.
 
     Raises:
-        UsageError: another process has locked it, or the folder does not exist.
+        UsageError: another process has locked it, or the folder cannot be opened.
     """
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be opened as a folder: {error.strerror}") from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:

@@ -115,8 +115,8 @@ class LogStructure:
         """Raise an error for damage or, with `skip_damaged`, note it."""
         if not self.skip_damaged:
             raise LogDamagedError(
-                f"{self.path}: {place}: {problem}; repair the file with cdmisfa recover, or "
-                "skip the damage with cdmisfa learn --skip-damaged"
+                f"{self.path}: {place}: {problem}; repair the file with cdmisfa recover "
+                "(of a recording or log, learn, convert and apply skip it with --skip-damaged)"
             )
         self.note(place, problem)
 

@@ -147,9 +147,11 @@ class EpisodeSource(StoredSource):
         self.notes = (f"{counted(len(alike), 'episode')}, {order}: {ends}",)
         for episode in episodes:
             if not are_alike(episode.spec, first.spec):
+                images = episode.spec.images and first.spec.images
                 yield (
                     f"{episode.name} is skipped: it has {_described(episode.spec)}, but the first "
                     f"log, {first.name}, has {_described(first.spec)}"
+                    f"{': --size and --rate make logs alike' if images else ''}"
                 )
 
     def pixels(self, stream: int) -> str:

@@ -15,7 +15,7 @@ from recorder.images.compressed import MAX_THREAD_PIXELS, compressed_image
 from recorder.images.pixels import Content, UnknownPixels
 from replay.logs.stream import BROKEN, LogStream
 
-REMEDY: Final = "skip broken images with --skip-damaged"
+REMEDY: Final = "learn, convert and apply replace broken images with --skip-damaged"
 
 # Images that are decoded at once.
 CORES: Final = thread_count()
