@@ -170,6 +170,8 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
             f"an image of {_size_text(whole)} is smaller than {_size_text(size)}: use larger "
             "images, or learn from smaller frames with --size"
         )
+    if inner == size:
+        return shrink(image, *size)
     frame = np.zeros(size, np.uint8)
     _middle(frame, inner)[:] = shrink(image, *inner)
     return frame
