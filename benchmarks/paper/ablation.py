@@ -37,7 +37,10 @@ READINGS: Mapping[str, Keys] = {
     "window of the gate (0004)": {"gate_window": ALL_TIME},
     "start of epsilon at 1.2 instead of 1": {"epsilon_start": 1.0},
 }
-"""What the paper does not state of its experiments, and the keys that leave nothing of it."""
+"""What the paper does not state of its experiments, and the keys that leave nothing of it.
+
+The numbers are those of docs/project/decisions.md.
+"""
 
 CASES: Mapping[str, Keys] = {
     "nothing: as decided": {},

@@ -73,7 +73,7 @@ static double window_rate(double window, int64_t count) {
  * CD-MISFA 1.0 has a gate by clusters instead of slowness: a node for each label, that is for each
  * stream, holds centres of the outputs there. Node, winner and error: Luciw, Kompella, Kazerounian
  * and Schmidhuber 2013; clusters with counts: Guedalia, London and Werman 1999. Our choices are in
- * decision 0014.
+ * decision 0014 of docs/project/decisions.md.
  */
 static int64_t nearest(const agent *a, const double *centres, const double *counts,
                        const double *y, double *distance) {

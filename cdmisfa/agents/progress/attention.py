@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 
 # Blocks in each of the two means that learning progress compares. Chosen on the benchmark seeds
-# 100 to 103 (decision 0027). A larger number smooths the progress, and a new stream is preferred
-# for longer because it has no two means yet.
+# 100 to 103 (decision 0027 of docs/project/decisions.md). A larger number smooths the progress, and
+# a new stream is preferred for longer because it has no two means yet.
 PROGRESS_BLOCKS = 8
 
 # Learning errors that a rule receives for each stream: enough for both means.

@@ -33,9 +33,10 @@ MIN_SPECTRUM = 4
 # (`STALLED_BLOCKS` in `decisions.py`). Set by hand; each error takes 8 bytes in every stored state.
 ERROR_HISTORY = 90
 
-# Largest number of candidates in memory, and largest total size in bytes (decision 0029). Beyond
-# it the candidate of another stream is dropped and starts again at that stream's next block. With
-# 1,000 streams of 64x48 the limits keep a run below 521 MB and a stored state below 28 MB.
+# Largest number of candidates in memory, and largest total size in bytes (decision 0029 of
+# docs/project/decisions.md). Beyond it the candidate of another stream is dropped and starts again
+# at that stream's next block. With 1,000 streams of 64x48 the limits keep a run below 521 MB and a
+# stored state below 28 MB.
 MAX_CANDIDATES = 32
 MAX_CANDIDATE_BYTES = 2 * 1024**3
 

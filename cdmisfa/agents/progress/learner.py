@@ -70,7 +70,8 @@ class ProgressLearner:
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
         # With more products than whitened components the slow features are lost among them: a sine
-        # mixed with noise is learned from frames of 4 values, and not of 7 (decision 0032).
+        # mixed with noise is learned from frames of 4 values, and not of 7 (decision 0032 of
+        # docs/project/decisions.md).
         few = expanded_size("quadratic", math.prod(spec.frame_shape)) <= config.components
         self._expansion = config.expansion or ("quadratic" if few else "none")
         self._n_inputs = count_inputs(self._expansion, spec)

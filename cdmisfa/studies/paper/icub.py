@@ -59,7 +59,8 @@ TEST_FRAMES = 4000
 # Smallest |r| with the position of an object, on the test frames, at which a module follows it.
 FOLLOWS = 0.9
 
-# Algorithm, and threshold of the clustering error of 1.0: that of decision 0014, and a looser one.
+# Algorithm, and threshold of the clustering error of 1.0: that of decision 0014
+# (docs/project/decisions.md), and a looser one.
 #
 # 1.0 gets the positions of the head as labels.
 LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))

@@ -40,7 +40,8 @@ TAUS: Mapping[float, float] = {10: 0.98, 30: 0.81, 50: 0.83, 100: 0.80}
 COLUMNS: Mapping[str, Mapping[float, float]] = {"sigma": SIGMAS, "nu": NUS, "tau": TAUS}
 QUICK_COLUMNS = {"sigma": {sigma: SIGMAS[sigma] for sigma in (0.008, 0.0009, 0.0)}}
 
-# Factor of epsilon in every iteration; the paper does not give it, decision 0013.
+# Factor of epsilon in every iteration; the paper does not give it, see decision 0013
+# in docs/project/decisions.md.
 DECAY = 0.998
 
 # Smallest mean number of rewarded blocks before a change. With fewer, the agent had hardly found an

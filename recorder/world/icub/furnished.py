@@ -25,8 +25,8 @@ from recorder.world.icub.world import World
 # Rays of a plate for each ray of a frame, along each side.
 FINE = 2
 
-# Shares of ambient, diffuse and mirrored light. These and the next constants are set by hand
-# (decision 0037), for a room that looks like a lit one.
+# Shares of ambient, diffuse and mirrored light. These and the next constants are set by hand, for a
+# room that looks like a lit one.
 LIGHTING = {"lightAmbientCoeff": 0.62, "lightDiffuseCoeff": 0.68, "lightSpecularCoeff": 0.1}
 
 # Share of light that is lost far from the lamp, distance at which half of it is, and position of

@@ -14,11 +14,11 @@ from cdmisfa.core.arrays import FloatArray
 # left).
 ROAM, YAW = "roam", "head_yaw"
 
-# Frames between two choices of a roaming head. Set by hand (decision 0038).
+# Frames between two choices of a roaming head. Set by hand.
 LOOK_FRAMES = 60
 
 # Default mean angle that a roaming head turns in a frame, degrees; `scene.transit` changes it. Set
-# by hand (decision 0038): it is 60 degrees a second at the default 8 frames a second.
+# by hand: it is 60 degrees a second at the default 8 frames a second.
 ROAM_TRANSIT = 7.5
 
 # Angle in a frame below which the head jumps (degrees): a turn would take thousands of frames.

@@ -17,7 +17,7 @@ from recorder.world.icub.config import IcubConfig
 # Rays along each side of a pixel; the pixel is their mean. More rays look smoother and take longer.
 SAMPLES = 2
 
-# Frames in which drifting light changes from its minimum to its maximum. Set by hand (0037).
+# Frames in which drifting light changes from its minimum to its maximum. Set by hand.
 _RISE = 1500
 
 # Stream number of the random noise.

@@ -104,7 +104,7 @@ def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
 
 
 # Physics steps of 1/240 s in a frame: the objects have 1/8 s to follow. These and the next
-# constants are set by hand (decision 0037).
+# constants are set by hand.
 STEPS = 30
 
 # Frames simulated at a time.

@@ -12,7 +12,7 @@ from recorder.world.icub.eyes import FAR, Matrix, far_projection, metres, to_cam
 from recorder.world.icub.room import Room
 from recorder.world.icub.world import World
 
-# Direction to the lamp in the root frame. These and the next constants are set by hand (0037).
+# Direction to the lamp in the root frame. These and the next constants are set by hand.
 LAMP = (-0.45, -0.6, 1.0)
 
 # Half the size of the lamp, as a share of its height; it determines how soft shadows are.
