@@ -151,8 +151,8 @@ class StoredSource(ClockedSource):
         """
         if not self.gaps:
             return self.first_frame, self.first_frame + self.frames
-        reserved, t = self._ranges[stream], self.first_frame + (t - self.first_frame) % self.frames
-        return reserved[bisect.bisect_right(reserved, t, key=lambda span: span[0]) - 1]
+        ranges, t = self._ranges[stream], self.first_frame + (t - self.first_frame) % self.frames
+        return ranges[bisect.bisect_right(ranges, t, key=lambda span: span[0]) - 1]
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t.

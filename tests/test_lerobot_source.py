@@ -90,7 +90,7 @@ def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Pat
         result = [block.frames for block in source.take_all(101 + PAUSE)]
     for block, numbers in zip(result, expected, strict=True):
         np.testing.assert_array_equal(block, numbers.astype(np.float32))
-    with pytest.raises(UsageError, match="no field state; choose of observation"):
+    with pytest.raises(UsageError, match="no field state; choose from observation"):
         external(out, fields=["state"])
     table = out / "data/chunk-000/file-000.parquet"
     pq.write_table(pq.read_table(table).slice(0, 50), table)

@@ -26,7 +26,6 @@ from recorder.images.pixels import MAX_PIXELS, MalformedImage, by_bands
 
 # Largest number of pixels of an image that is decoded in a thread, where no memory limit works.
 MAX_THREAD_PIXELS: Final = 4_000_000
-AT_ONCE: Final = 4_000_000
 
 _JPEG: Final = b"\xff\xd8"
 _PNG: Final = b"\x89PNG\r\n\x1a\n"

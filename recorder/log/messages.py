@@ -288,8 +288,7 @@ def transforms_encoder(gaze: Gaze, root: str) -> Encoder:
     """Return the encoder of the coordinate frames of a view, as `foxglove.FrameTransforms`.
 
     The frames are a chain: from the root to `VIEW/head`, turned by the yaw; to VIEW, tilted,
-        between
-    the eyes, with z along their gaze; and to each eye.
+    between the eyes, with z along their gaze; and to each eye.
     """
     message = FrameTransforms_pb2.FrameTransforms()
     view, head, middle = gaze.name, f"{gaze.name}/head", gaze.middle

@@ -2,7 +2,7 @@
 
 The bytes equal those of the mcap package, except for LZ4 blocks, and take a quarter of its time for
 each message: a message is only appended to its chunk, and all other work is done once for the
-    chunk.
+chunk.
 """
 
 from __future__ import annotations

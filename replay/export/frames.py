@@ -60,7 +60,7 @@ def shared_spans(source: LoggedSource) -> list[Span]:
     """Return the spans of frames without gaps in any stream.
 
     Raises:
-        UsageError: the folder has no log.
+        UsageError: the streams have no common frame.
     """
     streams = range(len(source.spec.streams))
     shared = functools.reduce(intersection, (_spans(source, stream) for stream in streams))

@@ -57,7 +57,12 @@ class Difference:
         return self.text("the first run", "the other one")
 
     def text(self, first: str, second: str) -> str:
-        """Return the place and both values as text, with the names of the runs."""
+        """Return the place and both values as text.
+
+        Args:
+            first: name of the first run, used where one run has ended.
+            second: name of the second run.
+        """
         if not self.signal:
             return f"iteration {self.iteration}: {first} {self.first}, {second} {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""

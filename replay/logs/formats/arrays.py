@@ -54,7 +54,7 @@ def streams(
     arrays = load_numbers(path)
     chosen = [name for name in arrays if not options.topics or fits_topic(name, options.topics)]
     if not chosen:
-        raise NoTopicError(f"{path}: no such array; choose of {', '.join(arrays)} with --topic")
+        raise NoTopicError(f"{path}: no such array; choose from {', '.join(arrays)} with --topic")
     try:
         return array_streams({name: arrays[name] for name in chosen}, options, path)
     except UsageError as error:

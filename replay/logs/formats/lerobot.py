@@ -179,7 +179,7 @@ def _numbers(path: Path, options: InputOptions) -> LogStream:
     check_topics(path, topic, options.topics)
     known = features(path)[0]
     if absent := [name for name in names if name not in known]:
-        raise UsageError(f"{path}: no field {absent[0]}; choose of {', '.join(known)}")
+        raise UsageError(f"{path}: no field {absent[0]}; choose from {', '.join(known)}")
     dataset = Dataset(path, ["dataset_from_index"])
     files = sorted((path / "data").rglob("*.parquet"))
     if not files:

@@ -122,9 +122,8 @@ class VideoFile:
         stream.thread_type = "NONE"
         context = stream.codec_context
         context.thread_count = 1
-        context.options = {
-            "err_detect": "explode"
-        }  # else FFmpeg conceals errors with invented pixels
+        # Else FFmpeg conceals errors with invented pixels.
+        context.options = {"err_detect": "explode"}
         if not 0 < context.width * context.height <= MAX_PIXELS:
             size = f"{context.width}x{context.height}"
             raise LogDamagedError(f"{self.path}: images of {size} pixels are not supported")
