@@ -191,7 +191,7 @@ def open_arrays(
 def _with_color(
     opened: Callable[[InputOptions], LoggedSource], inputs: InputOptions
 ) -> LoggedSource:
-    """Open a source in colours if hue adds information to brightness; see `shows_hue`."""
+    """Open a source in colors if hue adds information to brightness; see `shows_hue`."""
     with opened(replace(inputs, color=True)) as colored:
         color = shows_hue(colored)
     source = opened(replace(inputs, color=color))

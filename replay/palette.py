@@ -1,6 +1,6 @@
-"""Colours that people with any colour vision can tell apart, for the viewer and figures.
+"""Colors that people with any color vision can tell apart, for the viewer and figures.
 
-The figures that redraw the paper's panels have their own colours.
+The figures that redraw the paper's panels have their own colors.
 
 Source: Okabe and Ito, Color Universal Design (2008).
 """
@@ -25,7 +25,7 @@ VERMILLION: Rgb = (213, 94, 0)
 PURPLE: Rgb = (204, 121, 167)
 GREY: Rgb = (136, 136, 136)
 
-# Colours of streams, and of what belongs to one.
+# Colors of streams, and of what belongs to one.
 CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 
 SAND: Rgb = (190, 180, 130)
@@ -42,40 +42,40 @@ CLAY: Rgb = (195, 140, 130)
 BRICK: Rgb = (190, 95, 90)
 BROWN: Rgb = (140, 115, 95)
 
-# Colours of the states of streams: not decided, learned, explained, rejected; no stream has one.
+# Colors of the states of streams: not decided, learned, explained, rejected; no stream has one.
 STATE_COLOURS: tuple[Rgb, ...] = (SAND, PLUM, MIST, DARK)
 
-# Colours of lines that belong to no stream: a full colour is a stream's, and its module's. They are
+# Colors of lines that belong to no stream: a full color is a stream's, and its module's. They are
 # seen on black, and on the white on which browsers show the viewer.
 PALE: tuple[Rgb, ...] = (STEEL, KHAKI, PLUM, MOSS, CLAY, BROWN)
 
-# Shades between white and a full colour: as many as eight bits distinguish.
+# Shades between white and a full color: as many as eight bits distinguish.
 STEPS = 255
 
 
 def colour(index: int) -> Rgb:
-    """Return the colour of stream number `index`, from 0."""
+    """Return the color of stream number `index`, from 0."""
     return CYCLE[index % len(CYCLE)]
 
 
 def pale(index: int) -> Rgb:
-    """Return the colour of line number `index`, from 0, that belongs to no stream."""
+    """Return the color of line number `index`, from 0, that belongs to no stream."""
     return PALE[index % len(PALE)]
 
 
 def faint(rgb: Rgb) -> Rgba:
-    """Return a half transparent colour, which is readable on black and on white."""
+    """Return a half transparent color, which is readable on black and on white."""
     return (*rgb, 0x80)
 
 
 def packed(rgb: RgbOrRgba) -> int:
-    """Return a colour as 0xRRGGBBAA."""
+    """Return a color as 0xRRGGBBAA."""
     red, green, blue, *opacity = rgb
     return red << 24 | green << 16 | blue << 8 | (opacity[0] if opacity else 0xFF)
 
 
 def packed_all(colours: Sequence[RgbOrRgba]) -> NDArray[np.uint32]:
-    """Return colours as an (n,) array, the form that the viewer accepts for any n."""
+    """Return colors as an (n,) array, the form that the viewer accepts for any n."""
     return np.array([packed(rgb) for rgb in colours], dtype=np.uint32)
 
 
@@ -83,7 +83,7 @@ def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Return weights as an image: blue below zero, white at zero, vermillion above.
 
     Args:
-        weights: (height, width); the largest magnitude gets the full colour.
+        weights: (height, width); the largest magnitude gets the full color.
 
     Returns:
         (height, width, 3) uint8.
@@ -95,7 +95,7 @@ def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def _shades() -> NDArray[np.uint8]:
-    """Return (2 STEPS + 1, 3) colours from blue over white to vermillion."""
+    """Return (2 STEPS + 1, 3) colors from blue over white to vermillion."""
     part = np.linspace(-1.0, 1.0, 2 * STEPS + 1)[:, None]
     white = np.array([255.0, 255.0, 255.0])
     low, high = np.array(BLUE, dtype=float), np.array(VERMILLION, dtype=float)

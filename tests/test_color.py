@@ -147,8 +147,8 @@ def pictures(folder: Path, frames: NDArray[np.uint8]) -> Path:
 @pytest.mark.parametrize(
     ("frames", "said", "word", "width"),
     [
-        (COLOR["hue alone"], "so frames have colour", "on", 3 * W),
-        (GREY["coloured noise on grey"], "frames are grey", "off", W),
+        (COLOR["hue alone"], "so frames have color", "on", 3 * W),
+        (GREY["coloured noise on grey"], "frames are gray", "off", W),
     ],
 )
 def test_the_choice_is_said_and_the_run_goes_on_with_it(

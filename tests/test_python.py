@@ -103,7 +103,7 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
         ),
         (
             {"cam": np.zeros((9, 3, 20, 30))},
-            r"cam: .* np.moveaxis\(x, 1, -1\) moves the colours to the end",
+            r"cam: .* np.moveaxis\(x, 1, -1\) moves the colors to the end",
         ),
         (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
         (["one", 2], "shape .* of <U21 is not supported: use"),

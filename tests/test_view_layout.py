@@ -61,7 +61,7 @@ def test_axes_hold_what_is_drawn_and_leave_room_for_the_legend(built):
             assert time["end"] >= 1.1 * ITERATIONS * TAU, name
         elif time is not None:  # a window of frames up to the cursor, or up to a save
             assert time["end"] - time["start"] < 20 * TAU, name
-        says = any(word in name.lower() for word in ("slowness", "(grey", "rule", "q of"))
+        says = any(word in name.lower() for word in ("slowness", "(gray", "rule", "q of"))
         assert legend is True or len(entities) == 1 or says, name
     assert held >= 4
     assert sum(time["start"] < 0 < time["end"] for _, _, time, *_ in plots if time) >= 2

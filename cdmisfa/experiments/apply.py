@@ -108,7 +108,7 @@ class Application:
 
         Args:
             words: the source, as `cdmisfa learn` takes it.
-            inputs: which part of logs to use; size, fit and colour come from the recipe.
+            inputs: which part of logs to use; size, fit and color come from the recipe.
             loop: True to start again at the end.
             skip_damaged: True to skip damaged parts.
             say: called with a line when the state of a camera changes.

@@ -58,7 +58,7 @@ class FoxgloveCamera:
         host: host of the server, with its port.
         topic: name of the topic; "" for the only one with images.
         name: name of the stream.
-        options: the fields to read, the range of distances, and whether to decode colours.
+        options: the fields to read, the range of distances, and whether to decode colors.
 
     Raises:
         UsageError: websockets is missing.

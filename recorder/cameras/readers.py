@@ -53,7 +53,7 @@ class Camera(Protocol):
 
         Yields:
             The age of the image (ns), 0 if only its arrival is known, and the image in its own
-            size: gray (height, width) uint8, colour (height, width, 3) uint8, or finite numbers
+            size: gray (height, width) uint8, color (height, width, 3) uint8, or finite numbers
             (I,) float64, equally many each time.
 
         Raises:

@@ -130,7 +130,8 @@ class GymSource(SteppedSource):
     Args:
         tasks: ids of environments, or environments made with `render_mode="rgb_array"`.
         names: names of the streams; None: the ids.
-        size: (height, width) of a frame; None: that of the images, at most 48x128 pixels.
+        size: (height, width) of a frame; None: the aspect ratio of the images, with at most as
+            many pixels as 128x48.
         fit: "crop", "pad" or "stretch" images of another aspect ratio.
         fps: frames per second; None: as the first environment states.
         seed: seed of the environments and of random actions.
@@ -268,7 +269,7 @@ def make_environment(task: str, **options: Any) -> Any:
 
 
 def gray_image(image: Any) -> ByteArray:
-    """Convert a colour image, (height, width, 3), to gray, (height, width) uint8."""
+    """Convert a color image, (height, width, 3), to gray, (height, width) uint8."""
     return np.asarray(Image.fromarray(image).convert("L"))
 
 

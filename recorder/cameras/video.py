@@ -39,7 +39,7 @@ class VideoCamera:
     Args:
         word: `camera:DEVICE`, `av:FORMAT:ADDRESS`, `av:ADDRESS`, or a URL.
         name: name of the stream.
-        color: True to decode colours.
+        color: True to decode colors.
 
     Raises:
         UsageError: PyAV is missing, or the device does not exist.

@@ -1,4 +1,4 @@
-"""How images and numbers become frames: size, crop, padding, colours.
+"""How images and numbers become frames: size, crop, padding, colors.
 
 A `Framing` serves the images of a log or a camera; a `Recipe` repeats it for a user's raw images.
 """
@@ -339,7 +339,7 @@ def pixels_of(images: NDArray[Any]) -> NDArray[Any]:
 
 
 def _image(array: NDArray[Any], recipe: Recipe) -> Content:
-    """Return the image of an array, gray (height, width) or colour (height, width, 3)."""
+    """Return the image of an array, gray (height, width) or color (height, width, 3)."""
     if recipe.range is None:
         array = pixels_of(array)
     if array.ndim == 3 and array.shape[2] == 1:

@@ -245,7 +245,7 @@ def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:
 
     Args:
         kind: kind of the messages.
-        options: the fields to read, or else the range of distances and whether to keep colours.
+        options: the fields to read, or else the range of distances and whether to keep colors.
 
     Returns:
         A function that returns an image, or numbers (I,) float64. It raises MalformedImage, or

@@ -23,7 +23,7 @@ VIDEO_RECIPE: Final = (
     "display matrix"
 )
 
-# How images become frames in colour.
+# How images become frames in color.
 COLOR_RECIPE: Final = (
     "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
     "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
@@ -39,7 +39,7 @@ Size = tuple[int, int]
 # Range of distances (m) that are black and white, or range to which numbers are limited.
 Depth = tuple[float, float]
 
-# Whether frames are in colour; "auto" decides by the first frames of a log.
+# Whether frames are in color; "auto" decides by the first frames of a log.
 Color = bool | Literal["auto"]
 
 # How an image of another aspect ratio becomes a frame: see `fitted`.

@@ -1,4 +1,4 @@
-"""Conversion of raw pixels in all supported formats to gray or colour, and shrinking of images."""
+"""Conversion of raw pixels in all supported formats to gray or color, and shrinking of images."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.options import Depth
 
-# Content of a message: a gray image (height, width) uint8, a colour image (height, width, 3) uint8,
+# Content of a message: a gray image (height, width) uint8, a color image (height, width, 3) uint8,
 # or numbers (I,) float64.
 Content = NDArray[Any]
 
@@ -34,7 +34,7 @@ ENCODINGS: Final[Mapping[str, str]] = {
     "8UC4": "bgrX",
 }
 
-# Formats with one colour for each pixel, and the colours of two by two pixels, row by row.
+# Formats with one color for each pixel, and the colors of two by two pixels, row by row.
 _BAYER: Final[Mapping[str, str]] = {
     f"bayer_{order}{bits}": order for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)
 }
@@ -140,7 +140,7 @@ def by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> By
 
 
 def _bayer(pixels: ByteArray, order: str, *, color: bool) -> ByteArray:
-    """Return gray or colour of each two by two pixels; green is the mean of its two pixels."""
+    """Return gray or color of each two by two pixels; green is the mean of its two pixels."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
         raise MalformedImage("its Bayer pattern has less than two rows or columns")

@@ -1,7 +1,7 @@
-"""Images of videos, decoded by PyAV (FFmpeg) to gray or colour.
+"""Images of videos, decoded by PyAV (FFmpeg) to gray or color.
 
-Gray is the luma that a video stores, because the bits of FFmpeg's colour conversion depend on the
-processor. Only videos without luma are converted from their colours.
+Gray is the luma that a video stores, because the bits of FFmpeg's color conversion depend on the
+processor. Only videos without luma are converted from their colors.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _UNIT: Final = re.compile(b"\0\0\1(.)", re.DOTALL)
 
 
 def frame_gray(frame: Any) -> ByteArray:
-    """Return the luma of a PyAV frame, or the gray of its colours, upright, (height, width)."""
+    """Return the luma of a PyAV frame, or the gray of its colors, upright, (height, width)."""
     return _upright(_luma(frame), frame)
 
 
 def frame_colors(frame: Any) -> ByteArray:
-    """Return the colours of a PyAV frame, upright, (height, width, 3); its luma if it has none."""
+    """Return the colors of a PyAV frame, upright, (height, width, 3); its luma if it has none."""
     return _upright(_colors(frame), frame)
 
 
@@ -126,7 +126,7 @@ class VideoPackets:
 
     Args:
         packet_of: returns the packet of a message; raises MalformedImage.
-        color: True to return colours; see `raw_image`.
+        color: True to return colors; see `raw_image`.
     """
 
     def __init__(

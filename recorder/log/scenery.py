@@ -192,7 +192,7 @@ def turns_of(config: Mapping[str, Any], streams: Sequence[int]) -> tuple[tuple[i
 
 
 def _paint(config: Mapping[str, Any], name: str) -> tuple[float, float, float] | None:
-    """Return the colour of an object that has a texture, else None."""
+    """Return the color of an object that has a texture, else None."""
     return painted(name) if config.get("texture") else None
 
 

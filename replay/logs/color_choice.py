@@ -1,4 +1,4 @@
-"""Decide whether a log needs colour: whether hue adds information to brightness."""
+"""Decide whether a log needs color: whether hue adds information to brightness."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ LOOKED: Final = 2000
 # Frames from one examined frame to the next: lasting changes correlate over it, noise does not.
 STEP: Final = 5
 
-# Cells across and down an image, whose mean colours are compared.
+# Cells across and down an image, whose mean colors are compared.
 _CELLS = 8
 
-# Of red, green and blue, as grey frames show them.
+# Of red, green and blue, as gray frames show them.
 _BRIGHTNESS: Final = np.array((0.299, 0.587, 0.114))[:, None, None]
 
-# Change of red or blue over that of brightness, up to which grey shows it as well; a red ball on
+# Change of red or blue over that of brightness, up to which gray shows it as well; a red ball on
 # black comes to that.
 _MOST_RATIO: Final = 2.0
 
@@ -39,13 +39,13 @@ _LEAST = 0.25
 
 # Note on the choice.
 CHOSEN: Final = {
-    True: "--color auto: hue varies independently of brightness, so frames have colour",
-    False: "--color auto: hue adds nothing to brightness, so frames are grey",
+    True: "--color auto: hue varies independently of brightness, so frames have color",
+    False: "--color auto: hue adds nothing to brightness, so frames are gray",
 }
 
 
 def shows_hue(source: StoredSource) -> bool:
-    """Return whether one stream of a source in colours shows more than it would in gray."""
+    """Return whether one stream of a source in colors shows more than it would in gray."""
     for stream in range(len(source.spec.streams)):
         times = range(0, min(source.frames, LOOKED), STEP)
         looked = [block.frames for t in times for block in source.pieces(stream, t, t + 1, 1)]

@@ -32,7 +32,7 @@ class Images:
 
     Args:
         streams: the streams.
-        color: whether images are decoded in their colours.
+        color: whether images are decoded in their colors.
         skip_damaged: show for a broken image the last whole one before it, else the first of all.
     """
 

@@ -53,7 +53,7 @@ class LoggedSource(StoredSource):
         streams: the streams.
         recorded: whether they are the views of a recording.
         framings: for each stream how an image becomes a frame; None for recordings.
-        color: whether frames show colours.
+        color: whether frames show colors.
         in_memory: whether they are arrays of the caller.
         alignment: for each stream the counts of its rows, of repeated frames and of dropped rows.
         pauses: for each stream the frames [start, stop) of its gaps.

@@ -41,7 +41,7 @@ NUMBERS = 12
 
 
 def colour_class(index: int) -> str:
-    """Return the CSS class of a stream's colour."""
+    """Return the CSS class of a stream's color."""
     return f"c{index % len(CYCLE)}"
 
 

@@ -40,7 +40,7 @@ def build_overlay(
     force: bool = False,
     tab: str | None = None,
 ) -> None:
-    """Write the curves of several runs, one colour a run, into one .rrd file.
+    """Write the curves of several runs, one color a run, into one .rrd file.
 
     The entity `/compare/<number>_<run>/<signal>` holds a run's signal at every iteration.
 

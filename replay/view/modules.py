@@ -55,7 +55,7 @@ def saved_mark() -> rr.SeriesPoints:
 def hang_weights(
     writer: Writer, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
 ) -> None:
-    """Place the weights of several outputs in a grid, with grey borders by default."""
+    """Place the weights of several outputs in a grid, with gray borders by default."""
     if not writer.spec.images or len(labels) == 1:
         return
     height, width = writer.spec.frame_shape
@@ -68,7 +68,7 @@ def hang_weights(
 def write_weights(writer: Writer, path: str, t: int, iteration: int, phi: FloatArray) -> None:
     """Show (J, I) weights at a frame and iteration: as images, or bars.
 
-    Each output's image, at `path` or of several at `path/<number>`, is in full colour at its own
+    Each output's image, at `path` or of several at `path/<number>`, is in full color at its own
     largest weight.
     """
     shape = writer.spec.frame_shape
@@ -256,7 +256,7 @@ class ModulesView:
             name, rgbs = f"module {number} on {stream}", [colour(s)]
             self._writer.lines(f"{root}/output", [name], (t, where), y[:, None], rgbs, gap=1)
             function, r = drawable(best.function), f"|r| = {best.r:.2f}"
-            title = f"Module {number} ({drawable(stream)}) follows {function} (grey), {r}"
+            title = f"Module {number} ({drawable(stream)}) follows {function} (gray), {r}"
             entities = f"/{root}/followed", f"/{root}/output"
             panels.append(Panel(title, entities, "recent", fit=True, legend=False))
         self._writer.flush()

@@ -29,7 +29,7 @@ from replay.view.writer import WIDTH, Writer, changes, drawable, part, power_of_
 # Signals that are timelines of the view, not curves.
 TIMELINES = ("iteration", "t", "log_time")
 
-# Index of the first colour of signals that share a plot with another signal.
+# Index of the first color of signals that share a plot with another signal.
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
 
 # Signals that are also drawn as log10, as they fall over several powers of ten.
@@ -136,7 +136,7 @@ class Inputs:
             self._writer.event(event.t, event.iteration, event.text, event.level)
 
     def _name(self, columns: SignalColumns) -> None:
-        """Put a border around the attended image, with colour and name of its stream."""
+        """Put a border around the attended image, with color and name of its stream."""
         turns = changes(columns["stream"], self._named)
         if not len(turns):
             return

@@ -48,7 +48,7 @@ THIN, THICK = 0.0015, 0.005
 # Edges of a pyramid: four along its sides, one around its end.
 EDGES = 5
 
-# Added to the greys of objects: the viewer's background is as dark as they are.
+# Added to the grays of objects: the viewer's background is as dark as they are.
 LIGHT = 0.25
 
 # The joints that turn the head to the left, and bend it upwards.
@@ -215,7 +215,7 @@ class SceneView:
         self._look([(*when, look, colour(s)) for when, look in zip(at, gazes, strict=True)])
 
     def _look(self, poses: Sequence[tuple[int, int, Gaze, Rgb]]) -> None:
-        """Write the direction of the head at frames and iterations, in the colour of the view."""
+        """Write the direction of the head at frames and iterations, in the color of the view."""
         if not poses:
             return
         frames, iterations, gazes, rgbs = zip(*poses, strict=True)
@@ -269,7 +269,7 @@ def pyramid(eye: Eye) -> list[list[list[float]]]:
 
 
 def _shape(thing: Thing, light: float = 0.0) -> Any:
-    """Return the shape and colour of a thing; grey ones are made lighter."""
+    """Return the shape and color of a thing; gray ones are made lighter."""
     light = light if len(set(thing.colour)) == 1 else 0.0
     rgb = [round(255 * min(part + light, 1.0)) for part in thing.colour]
     half = [size / 2 for size in thing.size]

@@ -25,7 +25,7 @@ from replay.view.writer import Writer, drawable, part
 # Returns the code of the state in each of n blocks, (n,).
 Codes = Callable[[SignalColumns], IntArray]
 
-# Returns name and colour of the state with a code.
+# Returns name and color of the state with a code.
 States = Callable[[int], tuple[str, Rgb]]
 
 # Pieces of a run in a timeline of most blocks: more would be narrower than their labels.
@@ -120,7 +120,7 @@ class StateTimeline:
     Args:
         writer: writer of the Rerun recording.
         path: entity of the timeline.
-        states: name and colour of the state with a code.
+        states: name and color of the state with a code.
         piece: number of blocks that share one state; see `StateTimelines`.
         mixed: name of the state of pieces without a common state.
     """
@@ -210,7 +210,7 @@ def _verdict(code: int) -> tuple[str, Rgb]:
 
 
 def _state(code: int) -> tuple[str, Rgb]:
-    """Return name and colour of a stream's state; codes from `len(STATES)` name a module."""
+    """Return name and color of a stream's state; codes from `len(STATES)` name a module."""
     if code >= len(STATES):
         module = code - len(STATES)
         text = STATE_WORDS[_KNOWN]

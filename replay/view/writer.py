@@ -182,7 +182,7 @@ class Writer:
     ) -> None:
         """Buffer (n, ...) values that are drawn as lines; see `buffer`.
 
-        Names and colours, by default pale ones, count when the entity is first written.
+        Names and colors, by default pale ones, count when the entity is first written.
         """
         style = None
         if path not in self._buffers:
@@ -195,7 +195,7 @@ class Writer:
         self.buffer(path, at, values, style, gap=gap)
 
     def frames(self, path: str, at: At, values: NDArray[Any]) -> None:
-        """Buffer frames of the source: grey images, or lines of values."""
+        """Buffer frames of the source: gray images, or lines of values."""
         shape = self.spec.frame_shape
         if self.spec.images:
             form = rr.components.ImageFormat(

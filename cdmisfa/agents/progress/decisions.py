@@ -87,7 +87,7 @@ SLOWNESS_TOLERANCE = 1.25
 MEAN_IMAGE_CORRELATION = 0.65
 
 # Variance of a mean image, as a share of the variance of the frames, below which the mean image is
-# flat and its correlation says nothing. Measured: 0.007 for a light on a grey wall, 0.1 and more
+# flat and its correlation says nothing. Measured: 0.007 for a light on a gray wall, 0.1 and more
 # for every other stream.
 FLAT_MEAN_VARIANCE = 0.03
 

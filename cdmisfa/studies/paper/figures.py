@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart; one for each stream.
+# Okabe and Ito's colors, which color-blind readers can tell apart; one for each stream.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 STREAM_NAMES = ("$s_1$", "$s_2$", "$s_3$")

@@ -157,7 +157,7 @@ class NonStationary(Experiment):
         findings.notes = [note, CONTRADICTION]
 
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
-        """Draw policies against epsilon^c for two values of sigma; grey where rewards are few."""
+        """Draw policies against epsilon^c for two values of sigma; gray where rewards are few."""
         of_sigma = {v: of for (k, v), of in groups(trials, "key", "value").items() if k == "sigma"}
         both = of_sigma.keys() >= {*FIGURE_SIGMAS}
         sigmas = FIGURE_SIGMAS if both else (min(of_sigma), max(of_sigma))

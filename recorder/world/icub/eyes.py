@@ -73,7 +73,7 @@ def _projection(across: float, up: float, near: float, far: float) -> Matrix:
 
 
 def grey(colours: ByteArray) -> ByteArray:
-    """Convert colours (..., 3 or 4) to gray (...) by BT.601, rounded."""
+    """Convert colors (..., 3 or 4) to gray (...) by BT.601, rounded."""
     red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
     mixed = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
     return ((mixed + 500) // 1000).astype(np.uint8)

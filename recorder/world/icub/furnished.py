@@ -72,7 +72,7 @@ class FurnishedEyes:
         world: the world, whose plain bodies are replaced.
 
     Attributes:
-        shape: (height, width) of the joined image; in colour, the red, green and blue images of
+        shape: (height, width) of the joined image; in color, the red, green and blue images of
             both eyes are side by side.
     """
 
@@ -158,7 +158,7 @@ class FurnishedEyes:
         return part[0], part[1]
 
     def _draw_part(self, view: Matrix, part: ImagePart) -> tuple[ByteArray, NDArray[np.float32]]:
-        """Render the colours and the depth of a part of an image."""
+        """Render the colors and the depth of a part of an image."""
         (height, width), (rows, columns) = self._size, part
         down, across = rows.stop - rows.start, columns.stop - columns.start
         projection = list(self._projection)
@@ -169,7 +169,7 @@ class FurnishedEyes:
         return self._world.render(view, tuple(projection), across, down, LAMP, **LIGHTING)
 
     def _toned(self, colours: ByteArray) -> ByteArray:
-        """Convert colours (..., 3 or 4) to the channels of the eyes."""
+        """Convert colors (..., 3 or 4) to the channels of the eyes."""
         return colours[..., :3] if self._channels == 3 else grey(colours)[..., None]
 
     def _plates_at(self, yaw: float) -> list[Plate]:
@@ -229,7 +229,7 @@ def _ball(scene: IcubConfig, across: float, height: float) -> tuple[tuple[float,
 
 
 def light_at(scene: IcubConfig, places: FloatArray, hidden: FloatArray) -> FloatArray:
-    """Return the factor of the colours at points (3, ...): shadows, and distance from the lamp."""
+    """Return the factor of the colors at points (3, ...): shadows, and distance from the lamp."""
     if not scene.shadow:
         return np.ones(hidden.shape)
     x, y, _ = places

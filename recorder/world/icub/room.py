@@ -132,7 +132,7 @@ class Piece:
     Attributes:
         mesh: mesh around its own origin.
         centre: position of that origin in the root frame (m).
-        colour: colour without a texture.
+        colour: color without a texture.
         paint: texture, or None.
         gloss: share of mirrored light.
         casts: True if it casts a shadow.
@@ -184,7 +184,7 @@ def _document() -> dict[str, Any]:
 
 
 def painted(name: str) -> Place:
-    """Return the colour of the textured "table", "box", "cylinder" or "ball"."""
+    """Return the color of the textured "table", "box", "cylinder" or "ball"."""
     document = _document()
     red, green, blue = {"table": document["table"], **document["objects"]}[name]["colour"]
     return red, green, blue

@@ -101,7 +101,7 @@ def _painted(base: Colour, value: Pixels) -> Pixels:
     return np.clip(value[..., None] * np.array(base, np.float32), 0.0, 1.0)
 
 
-# Textures by name: functions of a colour, a seed, and a number of boards, tiles, spots and so on.
+# Textures by name: functions of a color, a seed, and a number of boards, tiles, spots and so on.
 TEXTURES: dict[str, Callable[[Colour, int, int], Pixels]] = {
     "wood": wood,
     "tiles": tiles,

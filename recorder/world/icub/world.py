@@ -158,7 +158,7 @@ class World:
         light: tuple[float, float, float],
         **lighting: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Render a camera's image: colours (height, width, 4) and depth (height, width).
+        """Render a camera's image: colors (height, width, 4) and depth (height, width).
 
         Raises:
             CdmisfaError: the simulator reports an error.

@@ -37,8 +37,8 @@ RECIPE: Final = (
 
 # Remedy in errors about an unsupported shape.
 _FORMS: Final = (
-    "use (n,) or (n, values) for numbers, (n, height, width) for grey images, or "
-    "(n, height, width, 3) for images in colour"
+    "use (n,) or (n, values) for numbers, (n, height, width) for gray images, or "
+    "(n, height, width, 3) for images in color"
 )
 
 
@@ -68,9 +68,9 @@ def array_streams(
 
     Args:
         arrays: by the stream's name numbers (n,) or (n, I) of any type, or images (n, height,
-            width), or in colours (n, height, width, 3 or 4), of uint8, uint16, bool, or floats of
+            width), or in colors (n, height, width, 3 or 4), of uint8, uint16, bool, or floats of
             0 to 1; arrays, lists, or tables of pandas, Polars, Arrow or DuckDB.
-        options: whether colours are shown.
+        options: whether colors are shown.
         path: path of their file; None for arrays of the caller.
 
     Raises:
@@ -165,7 +165,7 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
         array = array[..., 0] if array.shape[3] == 1 else array[..., :3]
     images = array.ndim == 3 or (array.ndim == 4 and array.shape[3] == 3)
     if array.dtype.kind not in "biuf" or not (images or array.ndim == 2) or not array.size:
-        hint = "; np.moveaxis(x, 1, -1) moves the colours to the end" if array.ndim == 4 else ""
+        hint = "; np.moveaxis(x, 1, -1) moves the colors to the end" if array.ndim == 4 else ""
         raise UsageError(
             f"{name}: shape {array.shape} of {array.dtype} is not supported: {_FORMS}{hint}"
         )

@@ -31,7 +31,7 @@ METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 1024 * 1024
 
 # Largest ratio of unpacked to packed size, against files that would fill the disk. Contents up to
-# the size of a chunk are always accepted. Only images of one colour exceed the ratio.
+# the size of a chunk are always accepted. Only images of one color exceed the ratio.
 MOST_TIMES: Final = 100
 
 
