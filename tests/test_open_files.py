@@ -18,12 +18,15 @@ from waiting import python
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log import logfile
+from recorder.log.manifest import MAX_NAMED
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap import store
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import OnePass, Store
-from recorder.recording import record, record_scene
+from recorder.recording import record, record_scene, recorded
 from replay.integrity.recover import RepairedStore
+from replay.integrity.verify import check_log
+from replay.open_sources import open_recording
 
 HERE = Path(__file__).parent
 LIMIT = 64
@@ -163,3 +166,32 @@ def stated(folder: Path, view: str) -> dict[str, str]:
     with LogReader(folder / f"{view}.mcap") as reader:
         (record,) = (r for r in reader.metadata if r.name == RECORDING_METADATA)
         return dict(record.metadata)
+
+
+def test_each_of_many_views_names_only_itself(tmp_path: Path) -> None:
+    few, many, more = (tmp_path / name for name in ("few", "many", "more"))
+    for folder, count in ((few, MAX_NAMED), (many, MAX_NAMED + 1), (more, MAX_NAMED + 50)):
+        record(ManyViews(count), folder, frames=5)
+    assert stated(few, "v0001")["streams"].split(",") == list(ManyViews(MAX_NAMED).spec.streams)
+    assert "stream_count" not in stated(few, "v0001")
+    facts = stated(more, "v0007")
+    assert (facts["streams"], facts["stream_count"], facts["stream_index"]) == ("", "150", "7")
+    one, other = (folder / "v0007.mcap" for folder in (many, more))
+    assert one.stat().st_size == other.stat().st_size < (few / "v0007.mcap").stat().st_size
+    for folder in (few, many, more):
+        with open_recording(folder) as source:
+            assert source.spec.streams == ManyViews(len(list(folder.iterdir()))).spec.streams
+            (config,) = LogReader(folder / "v0000.mcap").attachments
+            assert config.name == "config.json"
+        assert check_log(folder).ok
+        assert len(recorded(folder)) == len(list(folder.iterdir()))
+
+
+def test_a_missing_one_of_many_views_is_noticed(tmp_path: Path) -> None:
+    record(ManyViews(MAX_NAMED + 3), tmp_path, frames=5)
+    for number in (17, 99):
+        (tmp_path / f"v{number:04d}.mcap").unlink()
+    (problem,) = check_log(tmp_path).problems
+    expected = "2 files of the recording's views 0 to 102 are missing, the first of view 17"
+    assert problem.what == expected
+    assert not recorded(tmp_path)

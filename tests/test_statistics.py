@@ -27,6 +27,14 @@ def test_two_levels_with_much_data_have_the_closed_form_fit() -> None:
     assert fit == pytest.approx(-low / (high - low), abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("x", "yes"),
+    [([0.2, 0.9], [False, False]), ([0.2, 0.9], [True, True]), ([0.5, 0.5], [False, True])],
+)
+def test_answers_that_do_not_change_have_no_midpoint(x: list[float], yes: list[bool]) -> None:
+    assert math.isnan(statistics.logistic_midpoint(x, yes))
+
+
 def test_wilson_interval_has_the_textbook_values() -> None:
     assert statistics.wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
     assert statistics.wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
@@ -40,3 +48,13 @@ def test_correlation_has_known_answers() -> None:
     assert r[:3] == pytest.approx([0, 1, 0], abs=1e-12)
     assert r[3] == pytest.approx(abs(np.corrcoef(np.sin(t), t)[0, 1]))
     assert statistics.correlation(t, 3 - 2 * t) == pytest.approx(1.0)
+
+
+def test_the_interval_of_a_mean_contains_it_in_95_percent_of_samples() -> None:
+    rng = np.random.default_rng(0)
+    for n in (3, 10, 40):
+        bounds = np.array([statistics.mean_interval(rng.normal(2.0, 3.0, n)) for _ in range(4000)])
+        inside = (bounds[:, 0] < 2.0) & (bounds[:, 1] > 2.0)
+        assert inside.mean() == pytest.approx(0.95, abs=0.012)
+    assert statistics.mean_interval([5.0, math.nan]) == (-math.inf, math.inf)
+    assert statistics.mean_interval([1.0, 1.0]) == (1.0, 1.0)

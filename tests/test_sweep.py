@@ -12,12 +12,14 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import click
 import psutil
 import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
 from waiting import running, started, wait_for
 
+from cdmisfa.cli.commands.trials import parse_grid, parse_seeds
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.processes import WorkersError
@@ -286,3 +288,37 @@ def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> Non
     document = json.loads(shown("--json"))
     assert document["points"][1]["measures"]["iterations"] == {"mean": 5.0, "sd": None, "n": 1}
     assert "20 ± 10" in shown() == shown("--quiet")
+
+
+# The command
+
+
+def test_the_command_prints_one_document_and_names_failed_trials(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    record_scene("oscillatory", tmp_path / "log", frames=1000)
+    words = [str(tmp_path / "log"), "--grid", "learner.tau=100,2000", "--seeds", "0:2"]
+    words += ["--max-iterations", "20", "-o", str(tmp_path / "s"), "--json"]
+    outcome = cdmisfa("sweep", *words)
+    document = outcome.json
+    assert outcome.code == 1
+    assert (document["trials"], document["computed"], len(document["failed"])) == (4, 2, 2)
+    assert {row["point"]["learner.tau"] for row in document["failed"]} == {"2000"}
+    assert all("frames" in row["error"] for row in document["failed"])
+    summary = cdmisfa("sweep", tmp_path / "s", "--summary", "--json").json["points"][0]
+    # The log has 10 blocks of 100 frames.
+    assert (summary["done"], summary["measures"]["iterations"]["mean"]) == (2, 10.0)
+
+
+def test_grids_and_seeds_are_read_as_written() -> None:
+    assert parse_grid(("learner.sigma=0, .1", "learner.tau=40")) == {
+        "learner.sigma": ["0", ".1"],
+        "learner.tau": ["40"],
+    }
+    assert parse_seeds("0:3,7") == [0, 1, 2, 7]
+    for text in ("", "3:3", "-1", "a", "0:99999999999"):
+        with pytest.raises(click.UsageError, match="--seeds"):
+            parse_seeds(text)
+    for words in (("learner.sigma",), ("=1",), ("a.b=",)):
+        with pytest.raises(click.UsageError, match="--grid"):
+            parse_grid(words)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 from conftest import Cdmisfa
 from test_cli import assert_one_line
 
+from cdmisfa.experiments.documents import write_json
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 
@@ -61,6 +64,41 @@ def test_force_replaces_files_only(
     assert_one_line(cdmisfa(*words.split(), "--force"), 2, "is a device, pipe or socket")
     assert looks(tmp_path / out) == before
     assert os.listdir(tmp_path) == [out]
+
+
+OVERLAP = """
+import sys
+from pathlib import Path
+from recorder.log.files import atomic_write
+with atomic_write(Path(sys.argv[1])) as partial:
+    partial.write_text(sys.argv[2])
+    print(flush=True)
+    input()
+"""
+
+
+def test_two_processes_write_one_name(tmp_path: Path) -> None:
+    """Each writes a temporary file; the last one to end replaces the file."""
+    path = tmp_path / "a.csv"
+
+    def writer(text: str) -> subprocess.Popen[str]:
+        words = [sys.executable, "-c", OVERLAP, str(path), text]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        process = subprocess.Popen(words, text=True, **pipes)  # type: ignore[call-overload]
+        assert process.stdout.readline()
+        return process  # type: ignore[no-any-return]
+
+    writers = [writer("one"), writer("two")]
+    for process in writers:
+        process.communicate("\n")
+        assert process.returncode == 0
+    assert path.read_text() == "two"
+    killed = writer("three")
+    killed.kill()
+    killed.communicate()
+    assert len(list(tmp_path.iterdir())) == 2
+    write_json(path, {})
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def names(folder: Path) -> set[str]:

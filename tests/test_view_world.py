@@ -158,3 +158,12 @@ def test_a_recording_shows_its_world(tmp_path, monkeypatch):
     assert not [entity for entity in View(tmp_path / "r.rrd").names if "watching" in entity]
     said = [text for (text,) in rows["/events"]["TextLog:text"]]
     assert any("icub-models" in text for text in said)
+
+
+def test_the_body_of_the_robot_is_shown(tmp_path):
+    write_run(tmp_path / "run.mcap", SCENE, 3, source=LIVE)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    entities = View(tmp_path / "run.rrd").names
+    assert {r"\/" in e for e in entities} == {False}  # no name has an escaped slash
+    parts = {e.split("/")[2] for e in entities if e.startswith("/scene/")}
+    assert {"body", "joints", "neck", "stands", "box"} <= parts
