@@ -18,7 +18,6 @@ from conftest import Cdmisfa
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PAGES = [page for page in PAGES if page.parent.name not in ("explanation", "results")]
 BLOCK = re.compile(r"^```(console|sh|python|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 # Packages without which the code of a page cannot run.
@@ -32,6 +31,9 @@ PACKAGES = (
     "matplotlib",
     "rosbags",
 )
+
+# Pages that readers follow in a checkout: .gitignore covers the files that their commands write.
+IN_A_CHECKOUT = ("README", "first-run", "own-logs", "record", "look-at-a-run", "use-modules")
 
 
 def with_blocks() -> list[Path]:
@@ -104,6 +106,8 @@ class Page:
                 assert match, (
                     f"{line} prints (exit code {code}):\n{printed}\nthe page has:\n{output}"
                 )
+                # Such an output matches an error as well.
+                assert code == 0 or set(output.split()) != {"..."}, f"{line}: {printed}"
 
 
 @pytest.mark.parametrize("page", with_blocks(), ids=lambda page: str(page.relative_to(ROOT)))
@@ -121,6 +125,17 @@ def test_blocks_of_a_page_work_as_printed(
     run = Page(cdmisfa, page.stem)
     for language, block in BLOCK.findall(text):
         run.run(language, block)
+    if page.stem in IN_A_CHECKOUT:
+        assert untracked(tmp_path) == {".gitignore", "examples", "sample_logs"}
+
+
+def untracked(folder: Path) -> set[str]:
+    """Return what git would add in a folder with the project's .gitignore."""
+    (folder / ".gitignore").write_text((ROOT / ".gitignore").read_text("utf-8"))
+    subprocess.run(["git", "init", "-q"], cwd=folder, check=True)
+    status = ["git", "status", "--porcelain"]
+    done = subprocess.run(status, cwd=folder, capture_output=True, text=True, check=True)
+    return {line.removeprefix("?? ") for line in done.stdout.splitlines()}
 
 
 def test_a_block_that_differs_fails(cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,6 +146,7 @@ def test_a_block_that_differs_fails(cdmisfa: Cdmisfa, monkeypatch: pytest.Monkey
     for language, block in (
         ("console", "$ echo a\nb\n"),
         ("console", "$ echo a\n"),
+        ("console", "$ false\n...\n"),
         ("sh", "false\n"),
         ("pycon", ">>> 1\n2\n"),
     ):
