@@ -41,12 +41,12 @@ class KernelAgent:
         """What knows a block; outputs, slowness and clustering error of the frozen modules."""
         shown, expanded = kernels.frames_of(frames), kernels.frames_of(x)
         (M, J), n = frozen.band_mean.shape, len(frames)
-        reported = np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
+        outputs = np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
         stack = frozen.struct
         structs = (s.pointer for s in (self.struct, stack, shown, expanded))
-        into = (kernels.ffi.from_buffer("double[]", array) for array in reported)
+        into = (kernels.ffi.from_buffer("double[]", array) for array in outputs)
         kernels.check(kernels.lib.recognise(*structs, *into), "the learner")
-        return int(self.out["known_by"][0]), *reported
+        return int(self.out["known_by"][0]), *outputs
 
     def values(self) -> np.ndarray:
         """The action values, (S, 2)."""

@@ -92,11 +92,11 @@ def test_only_novel_blocks_of_the_stream_of_the_block_before_count_as_staying() 
     bench = Bench()
     start = (0.0, 0.9, 0.0)  # to the other stream after the block
     shares = [bench.step(draws=draws)["share"] for draws in (STAY, start, STAY, STAY)]
-    remaining = 1 - 2 / 41
-    assert shares[0] == pytest.approx(remaining)  # nothing came before
-    assert shares[1] == pytest.approx(1 - (1 - shares[0]) * remaining)
-    assert shares[2] == pytest.approx(shares[1] * remaining)
-    assert shares[3] == pytest.approx(1 - (1 - shares[2]) * remaining)
+    retained = 1 - 2 / 41
+    assert shares[0] == pytest.approx(retained)  # nothing came before
+    assert shares[1] == pytest.approx(1 - (1 - shares[0]) * retained)
+    assert shares[2] == pytest.approx(shares[1] * retained)
+    assert shares[3] == pytest.approx(1 - (1 - shares[2]) * retained)
 
 
 def test_eta_dot_is_the_running_mean_change_of_eta() -> None:
@@ -172,9 +172,9 @@ def test_after_a_save_everything_starts_anew() -> None:
     for name in Agent._fields[1:]:
         np.testing.assert_array_equal(getattr(bench.agent, name), getattr(fresh, name), name)
     memory, first = bench.memory, fresh.memory[0]
-    remaining = {"iteration": steps, "module": 2, "last_action": 0, "last_stream": 0}
+    unchanged = {"iteration": steps, "module": 2, "last_action": 0, "last_stream": 0}
     for name in fresh.memory.dtype.names:
-        np.testing.assert_array_equal(memory[name], remaining.get(name, first[name]), name)
+        np.testing.assert_array_equal(memory[name], unchanged.get(name, first[name]), name)
 
 
 @given(st.integers(1, 8), st.lists(st.tuples(st.floats(0, 1), *[st.floats(0, 0.99)] * 3)))

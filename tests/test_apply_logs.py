@@ -87,10 +87,10 @@ def test_a_folder_of_logs_becomes_one_table(
     rows = zip(table["log"].to_pylist(), table["stream"].to_pylist(), strict=True)
     recorded = {("rec", "cam"): 50, ("rec", "other"): 50}
     assert Counter(rows) == {(name, "cam"): 90 for name in NAMES} | recorded
-    reported = cdmisfa("apply", run, logs, "-o", out)
-    assert reported.code == 3
-    assert "7 logs: 0 processed now, 7 processed before, 2 failed or incomplete" in reported.out
-    assert "failed: broken.mcap: " in reported.out
+    done = cdmisfa("apply", run, logs, "-o", out)
+    assert done.code == 3
+    assert "7 logs: 0 processed now, 7 processed before, 2 failed or incomplete" in done.out
+    assert "failed: broken.mcap: " in done.out
 
 
 def test_the_same_bytes_come_of_processes_and_of_dask_though_a_worker_is_killed(
@@ -147,11 +147,11 @@ def test_only_what_is_missing_or_has_changed_is_done(
     assert again() == (1, 4)
 
     before = (logs / "a.mcap").stat()
-    remaining = shutil.copy2(logs / "a.mcap", tmp_path / "kept.mcap")
+    copy = shutil.copy2(logs / "a.mcap", tmp_path / "kept.mcap")
     camera(logs / "a.mcap", 60, 5)
     assert again() == (1, 4)
     assert files(out)["a.mcap.parquet"] != whole["a.mcap.parquet"]
-    shutil.copy2(remaining, logs / "a.mcap")
+    shutil.copy2(copy, logs / "a.mcap")
     assert (logs / "a.mcap").stat().st_mtime_ns == before.st_mtime_ns
     assert again() == (1, 4)
     assert files(out)["a.mcap.parquet"] == whole["a.mcap.parquet"]

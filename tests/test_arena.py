@@ -42,13 +42,13 @@ def test_modules_are_judged_against_batch_sfa() -> None:
 def test_a_probe_tells_what_is_in_the_features_and_no_more() -> None:
     rng = np.random.default_rng(0)
     features = rng.standard_normal((40000, 3))
-    reported = features @ [[1.0], [2.0], [-0.5]]
+    linear = features @ [[1.0], [2.0], [-0.5]]
     hidden, still = rng.standard_normal((40000, 1)), np.ones((40000, 1))
-    assert probe(features, reported) == pytest.approx(1.0, abs=1e-5)
-    assert probe(features, reported + 2.2913 * hidden) == pytest.approx(0.5, abs=0.03)
+    assert probe(features, linear) == pytest.approx(1.0, abs=1e-5)
+    assert probe(features, linear + 2.2913 * hidden) == pytest.approx(0.5, abs=0.03)
     assert probe(features, hidden) == pytest.approx(0.0, abs=0.01)
-    assert probe(features, np.hstack([reported, still])) == pytest.approx(1.0, abs=1e-5)
-    assert probe(np.zeros((40000, 1)), reported) == 0.0
+    assert probe(features, np.hstack([linear, still])) == pytest.approx(1.0, abs=1e-5)
+    assert probe(np.zeros((40000, 1)), linear) == 0.0
 
 
 def test_a_small_arena(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

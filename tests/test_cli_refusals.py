@@ -110,8 +110,8 @@ def test_it_is_refused_in_one_line(
             for word in words.split(" ")
         )
         said = [line.replace(f"and {name} ", f"and {place} ") for line in said]
-    remaining = contents(oscillatory_run)
+    before = contents(oscillatory_run)
     done = cdmisfa(*words.split(" "))
     assert_one_line(done, 2, *said)
     assert "--resume" in "".join(said) or "continue with --resume" not in done.err
-    assert contents(oscillatory_run) == remaining
+    assert contents(oscillatory_run) == before

@@ -173,8 +173,8 @@ def test_the_defaults_and_the_papers_constants() -> None:
     oscillatory = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
     icub = build(LearnerConfig, "learner", load_preset("icub")["learner"])
     assert oscillatory == learner() == LearnerConfig()
-    reported = [(c.nu, c.tau, c.sigma, c.delta, c.epsilon_start) for c in (oscillatory, icub)]
-    assert reported == [(0.05, 100, 0.0009, 0.0006, 1.2), (0.01, 40, 0.01, 0.0008, 1.2)]
+    values = [(c.nu, c.tau, c.sigma, c.delta, c.epsilon_start) for c in (oscillatory, icub)]
+    assert values == [(0.05, 100, 0.0009, 0.0006, 1.2), (0.01, 40, 0.01, 0.0008, 1.2)]
     assert (oscillatory.expansion, icub.expansion) == ("quadratic", "none")
 
 
@@ -200,9 +200,9 @@ def test_presets_from_files(tmp_path: Path, content: bytes | None, words: str) -
         file.write_bytes(content)
     with pytest.raises(UsageError, match=words) as caught:
         load_preset(str(file))
-    said = str(caught.value).replace(str(tmp_path), "")
-    assert len(said) < 700
-    assert "\n" not in said
+    message = str(caught.value).replace(str(tmp_path), "")
+    assert len(message) < 700
+    assert "\n" not in message
 
 
 def test_settings_are_section_key_value() -> None:
@@ -218,10 +218,10 @@ def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
     try:
         value = getattr(learner(**{key: text}), key)
     except UsageError as error:
-        reported = str(error)
+        message = str(error)
     else:
-        reported = f"learner.{key} is {value}"
-    assert reported.startswith(f"learner.{key} is")
+        message = f"learner.{key} is {value}"
+    assert message.startswith(f"learner.{key} is")
 
 
 @pytest.mark.parametrize(
@@ -230,9 +230,9 @@ def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
 )
 def test_docstrings_tell_every_key(section: type) -> None:
     """The page of keys is made of them."""
-    reported = "".join(inspect.getdoc(each) or "" for each in section.__mro__)
+    docstrings = "".join(inspect.getdoc(each) or "" for each in section.__mro__)
     for key in dataclasses.fields(section):
         if isinstance(key.default_factory, type):
             test_docstrings_tell_every_key(key.default_factory)
         else:
-            assert f"\n    {key.name}: " in reported, key.name
+            assert f"\n    {key.name}: " in docstrings, key.name

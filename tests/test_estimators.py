@@ -60,13 +60,13 @@ def test_however_the_samples_are_cut_it_is_batch_sfa(cut: int) -> None:
 def test_nothing_is_learned_across_a_gap(make: Make) -> None:
     X = waves()
     a, b = np.array_split(X, 2)
-    reported, untold = make().fit(a), make().fit(a)
+    with_gaps, without = make().fit(a), make().fit(a)
     for _ in range(20):
-        reported.partial_fit(b[:50] + 30.0, gap=True)
-        untold.partial_fit(b[:50] + 30.0)
-        reported.partial_fit(a[:50], gap=True)
-        untold.partial_fit(a[:50])
-    assert reported.slowness_[0] < untold.slowness_[0] / 2
+        with_gaps.partial_fit(b[:50] + 30.0, gap=True)
+        without.partial_fit(b[:50] + 30.0)
+        with_gaps.partial_fit(a[:50], gap=True)
+        without.partial_fit(a[:50])
+    assert with_gaps.slowness_[0] < without.slowness_[0] / 2
 
 
 @BOTH

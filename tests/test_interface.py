@@ -29,8 +29,8 @@ def entries(value: Any, name: str = "") -> Iterator[str]:
 
 
 def test_what_others_rely_on_is_what_was_written_down() -> None:
-    remaining = json.loads(interface.SNAPSHOT.read_text("utf-8"))
-    before, now = set(entries(remaining)), set(entries(interface.interface()))
+    snapshot = json.loads(interface.SNAPSHOT.read_text("utf-8"))
+    before, now = set(entries(snapshot)), set(entries(interface.interface()))
     changes = [f"gone: {line}" for line in sorted(before - now)]
     changes += [f"new: {line}" for line in sorted(now - before)]
     assert not changes, "\n".join([*changes, HOW])
@@ -49,11 +49,9 @@ def test_the_page_states_the_versions_of_files() -> None:
 
 
 def test_documents_on_stdout_are_versioned_and_alone(cdmisfa: Cdmisfa) -> None:
-    remaining = json.loads(interface.SNAPSHOT.read_text("utf-8"))
-    assert [
-        name for name, keys in remaining["keys of --json"].items() if "schema" not in keys
-    ] == []
-    with_json = {name for name, words in remaining["commands"].items() if "--json" in words}
-    looked_at = {name.partition(" ")[0] for name in remaining["keys of --json"]}
+    snapshot = json.loads(interface.SNAPSHOT.read_text("utf-8"))
+    assert [name for name, keys in snapshot["keys of --json"].items() if "schema" not in keys] == []
+    with_json = {name for name, words in snapshot["commands"].items() if "--json" in words}
+    looked_at = {name.partition(" ")[0] for name in snapshot["keys of --json"]}
     assert with_json - looked_at == {"demo", "reproduce"}
-    assert cdmisfa("signals", "--json").json["schema"] == remaining["formats"]["JSON documents"]
+    assert cdmisfa("signals", "--json").json["schema"] == snapshot["formats"]["JSON documents"]

@@ -31,17 +31,17 @@ def copied(agent: Agent) -> Agent:
     return Agent(*(array.copy() for array in agent))
 
 
-def assert_told(found: dict[str, Any], expected: dict[str, Any]) -> None:
-    assert {k: found[k] for k in EXACT} == {k: expected[k] for k in EXACT}
-    for name in found.keys() - EXACT:
-        np.testing.assert_allclose(found[name], expected[name], 1e-9, 1e-12, err_msg=name)
+def assert_signals(actual: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert {k: actual[k] for k in EXACT} == {k: expected[k] for k in EXACT}
+    for name in actual.keys() - EXACT:
+        np.testing.assert_allclose(actual[name], expected[name], 1e-9, 1e-12, err_msg=name)
 
 
-def assert_like(found: Agent, expected: Agent) -> None:
-    for name, one, two in zip(Agent._fields[1:], found[1:], expected[1:], strict=True):
+def assert_like(actual: Agent, expected: Agent) -> None:
+    for name, one, two in zip(Agent._fields[1:], actual[1:], expected[1:], strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12, err_msg=name)
     for name in MEMORY.names or ():
-        np.testing.assert_allclose(found.memory[name], expected.memory[name], 1e-9, 1e-12, name)
+        np.testing.assert_allclose(actual.memory[name], expected.memory[name], 1e-9, 1e-12, name)
 
 
 @st.composite
@@ -82,8 +82,8 @@ def test_an_agent_thinks_as_the_reference_does(
         xi = np.where(rng.random(len(y)) < 0.1, np.nan, rng.random(len(y)) * 0.02)
         known_by, draws = int(rng.choice([NOVEL, NOVEL, NOVEL, 1, CONSTANT])), rng.random(3)
         expected, t = copied(known.agent), known.t
-        reported = reference.think(expected, known.rules, known_by, xi, y, t, draws)
-        assert_told(known.think(xi, known_by, tuple(draws), y), reported)
+        expected_signals = reference.think(expected, known.rules, known_by, xi, y, t, draws)
+        assert_signals(known.think(xi, known_by, tuple(draws), y), expected_signals)
         assert_like(known.agent, expected)
         memory = known.memory["scale"]
         Q = reference.action_values(
@@ -105,8 +105,8 @@ def test_whatever_the_numbers_it_goes_on(
     for _ in range(15):
         y = np.where(rng.random(shape) < 0.3, rng.choice(special, shape), rng.random(shape))
         xi = np.where(rng.random(len(y)) < 0.5, rng.choice(special, len(y)), rng.random(len(y)))
-        reported = known.think(xi, NOVEL, tuple(rng.random(3)), y)
-        assert 0 <= reported["next_stream"] < len(known.agent.policy)
+        signals = known.think(xi, NOVEL, tuple(rng.random(3)), y)
+        assert 0 <= signals["next_stream"] < len(known.agent.policy)
         assert set(known.agent.policy) <= {0, 1}
 
 
@@ -157,10 +157,12 @@ def test_a_learner_is_the_reference_step_by_step(algorithm: str, outputs: int) -
             gap = reference.has_gap(agent.memory, block.stream, block.t)
             xi = feature.update(x, gap)
             y = (x - feature.mean) @ feature.phi.T
-        reported = reference.think(agent, copy.rules, gate[0], xi, y, block.t, draws)
+        expected_signals = reference.think(agent, copy.rules, gate[0], xi, y, block.t, draws)
         before = len(learner.modules)
         signals = learner.step(block)
-        assert_told({name: getattr(signals, name) for name in reported}, reported)
+        assert_signals(
+            {name: getattr(signals, name) for name in expected_signals}, expected_signals
+        )
         for result, expected in zip(
             (signals.y_frozen, signals.eta_inst_frozen, signals.roc_error_frozen, signals.y),
             (*gate[1:], y),

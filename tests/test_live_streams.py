@@ -112,9 +112,9 @@ def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:
 def test_pictures_of_ffmpeg_are_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     words = [TEST, TEST.replace("testsrc", "testsrc2"), "--size", "32x24"]
     assert "lavfi_testsrc: " in learned_twice(cdmisfa, tmp_path, *words)["said"]
-    removed = cdmisfa("check", tmp_path / "run")
-    assert removed.code == 2
-    assert f"{TEST} is a live stream, which cannot go back" in removed.err
+    refused = cdmisfa("check", tmp_path / "run")
+    assert refused.code == 2
+    assert f"{TEST} is a live stream, which cannot go back" in refused.err
     assert cdmisfa("check", tmp_path / "run", "--source", tmp_path / "rec").code == 0
 
 

@@ -84,12 +84,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     must("record", "oscillatory", "-o", folder / "log", "--frames", 1500)
     for algorithm in OF:
         for name, source in (("live", "oscillatory"), ("loop", folder / "log")):
-            reported = (*words(algorithm), *(["--loop"] if name == "loop" else []), *LEARN)
+            options = (*words(algorithm), *(["--loop"] if name == "loop" else []), *LEARN)
             for out, stops in ((name, (ENDS,)), (f"{name}-resumed", (17, 23, 64, ENDS))):
                 for stop in stops:
                     resume = () if stop == stops[0] else ("--resume",)
                     where = ("-o", folder / f"{algorithm}-{out}", *resume)
-                    must("learn", source, *reported, *where, "--max-iterations", stop)
+                    must("learn", source, *options, *where, "--max-iterations", stop)
     defaults["keyframes"] = None
     return folder
 
@@ -100,8 +100,8 @@ def straight() -> Callable[[str, int], Learner]:
 
     def after(algorithm: str, iterations: int) -> Learner:
         chosen = (f"learner.algorithm={algorithm}", *OF[algorithm])
-        source, reported = open_source(["oscillatory"], settings=chosen, seed=3)
-        learner = open_learner(reported.learner, source.spec, 3)
+        source, configuration = open_source(["oscillatory"], settings=chosen, seed=3)
+        learner = open_learner(configuration.learner, source.spec, 3)
         for _ in range(iterations):
             learner.step(source.take(learner.stream, learner.tau))
         return learner
@@ -198,8 +198,8 @@ def test_a_keyframe_that_lies_is_found_out(
 
     monkeypatch.setattr("replay.runs.keyframes.encode_keyframe", kept)
     keyframes_every(10)
-    reported = (*words("2.0"), *LEARN, "--max-iterations", 30)
-    assert cdmisfa("learn", "oscillatory", *reported, "-o", tmp_path / "run").code == 0
+    options = (*words("2.0"), *LEARN, "--max-iterations", 30)
+    assert cdmisfa("learn", "oscillatory", *options, "-o", tmp_path / "run").code == 0
     checked = cdmisfa("check", tmp_path / "run")
     assert checked.code == 4
     assert checked.out.startswith("iteration 19: keyframe abstraction.v[3, 1] differs: ")
@@ -213,14 +213,14 @@ def test_without_its_source_a_run_has_its_keyframes(
     keyframes_every(10)
     log, run = tmp_path / "log", tmp_path / "run"
     cdmisfa("record", "oscillatory", "-o", log, "--frames", 2000)
-    reported = (*words("2.0"), *LEARN, "--max-iterations", 25)
-    assert cdmisfa("learn", log, *reported, "-o", run).code == 0
+    options = (*words("2.0"), *LEARN, "--max-iterations", 25)
+    assert cdmisfa("learn", log, *options, "-o", run).code == 0
     log.rename(tmp_path / "moved")
     assert cdmisfa("inspect", run, "--iteration", 20, "--json").json["t"] == 800
-    removed = cdmisfa("inspect", run, "--iteration", 21)
-    assert removed.code == 2
-    assert len(removed.err.splitlines()) == 1
-    assert all(word in removed.err for word in ("no such file", "--source", "20 iterations"))
+    refused = cdmisfa("inspect", run, "--iteration", 21)
+    assert refused.code == 2
+    assert len(refused.err.splitlines()) == 1
+    assert all(word in refused.err for word in ("no such file", "--source", "20 iterations"))
     assert cdmisfa("inspect", run, "--iteration", 21, "--source", tmp_path / "moved").code == 0
 
 
@@ -285,10 +285,10 @@ def test_forks_of_forks_are_resumed_and_checked(
 ) -> None:
     keyframes_every(15)
     one, two, straight = (tmp_path / n for n in ("one", "two", "straight"))
-    reported = ("--no-rerun",)
-    fork = ("fork", place / parent, "--iteration", at, "--set", key, *reported, "-o", one)
+    options = ("--no-rerun",)
+    fork = ("fork", place / parent, "--iteration", at, "--set", key, *options, "-o", one)
     assert cdmisfa(*fork, "--max-iterations", 60).code == 0
-    again = ("fork", one, "--iteration", 52, "--seed", 9, *reported)
+    again = ("fork", one, "--iteration", 52, "--seed", 9, *options)
     assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
     assert cdmisfa(*again, "-o", straight, "--max-iterations", 110).code == 0
     resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")

@@ -259,12 +259,12 @@ def test_rules_choose_what_they_are_for(
 
 
 def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    names, reported = ("noise", "swing", "stroll"), ProgressConfig(components=8)
+    names, config = ("noise", "swing", "stroll"), ProgressConfig(components=8)
     one = run_session(
         MovingPictures(*names), ProgressConfig(components=8, outputs=1), tmp_path / "one"
     )
-    eight = run_session(MovingPictures(*names), reported, tmp_path / "run", rerun=False)
-    assert reported.outputs == 8
+    eight = run_session(MovingPictures(*names), config, tmp_path / "run", rerun=False)
+    assert config.outputs == 8
     assert [(m.stream, m.iteration) for m in eight.modules] == [
         (m.stream, m.iteration) for m in one.modules
     ]

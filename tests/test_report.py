@@ -180,10 +180,10 @@ def test_a_run_whose_source_changed_is_not_reproducible(
     assert "Reproducible yes: its source is present and looks unchanged" in text
     assert f"cdmisfa learn {recording} --max-iterations 9 -o RUN" in text
     first, second = sorted(recording.glob("*.mcap"))[:2]
-    remaining = first.read_bytes()
+    before = first.read_bytes()
     first.write_bytes(second.read_bytes())
     assert "Reproducible no: " in Page(write_report([run])).text
-    first.write_bytes(remaining)
+    first.write_bytes(before)
     recording.rename(tmp_path / "rec2")
     text = Page(write_report([run])).text
     assert re.search(r"Reproducible no: [^.]*no such file or folder", text)

@@ -48,31 +48,33 @@ def learned() -> dict[str, str]:
     """The `signals_sha256` of each learner, of vectors and of images."""
     actual = {}
     for algorithm in ("2.0", "1.0", "progress"):
-        reported = configure("oscillatory", Layers.read(words=[f"learner.algorithm={algorithm}"]))
-        source = reported.open_scene()
-        result = run_session(source, reported.learner, seed=3, max_iterations=20)
+        configuration = configure(
+            "oscillatory", Layers.read(words=[f"learner.algorithm={algorithm}"])
+        )
+        source = configuration.open_scene()
+        result = run_session(source, configuration.learner, seed=3, max_iterations=20)
         actual[algorithm] = result.signals_sha256
         if algorithm == "1.0":
             continue
-        images, reported = open_source(
+        images, configuration = open_source(
             [ROOT / "sample_logs" / "icub"],
             settings=[f"learner.algorithm={algorithm}"],
             seed=3,
             loop=True,
         )
         with contextlib.closing(images):
-            result = run_session(images, reported.learner, seed=3, max_iterations=2)
+            result = run_session(images, configuration.learner, seed=3, max_iterations=2)
         actual[f"{algorithm} of images"] = result.signals_sha256
     return actual
 
 
 def elsewhere(*emulator: str, **environment: str) -> tuple[bool, dict[str, str]]:
     # OpenBLAS takes this for the processor, whatever the emulated one can do.
-    remaining = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
+    variables = {name: value for name, value in os.environ.items() if name != "OPENBLAS_CORETYPE"}
     done = subprocess.run(
         [*emulator, sys.executable, "-c", PROGRAM, str(ROOT / "tests")],
         cwd=ROOT,
-        env={**remaining, **environment},
+        env={**variables, **environment},
         capture_output=True,
         text=True,
         timeout=600,

@@ -80,8 +80,8 @@ def test_a_colour_means_one_thing(built):
             meaning[rgb].add("mixed" if kind in ("several", "mixed", "switch") else kind)
         for rgb in parts.get("SeriesLines:colors", []):
             named = [s for s in IMAGE.streams if s in " ".join(parts["SeriesLines:names"])]
-            reported = entity.startswith(("/signals/", "/modules/"))  # a tab names its stream
-            assert named or reported or rgb not in map(packed, CYCLE), entity
+            has_tab = entity.startswith(("/signals/", "/modules/"))  # a tab names its stream
+            assert named or has_tab or rgb not in map(packed, CYCLE), entity
     assert len(meaning) > 5
     assert {rgb: kinds for rgb, kinds in meaning.items() if len(kinds) > 1} == {}
     assert [meaning[packed(rgb)] for rgb in CYCLE[:3]] == [{name} for name in IMAGE.streams]

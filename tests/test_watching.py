@@ -124,6 +124,9 @@ def test_the_example_of_ppo_runs(tmp_path: Path) -> None:
         "        assert self.env.observation_space.contains(seen)\n"
         "        return self.env.action_space.sample(), None\n"
     )
-    result = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])}
-    done = python(EXAMPLES / "ppo.py", check=True, env=result)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)]),
+    }
+    done = python(EXAMPLES / "ppo.py", check=True, env=environment)
     assert [line.partition(":")[0] for line in done.stdout.splitlines()] == ["PPO", "the learner"]

@@ -152,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("decoders", nargs="*", metavar="DECODER", help="by default all")
     parser.add_argument("--seconds", type=float, default=60, help="for each")
     chosen = parser.parse_args(arguments)
-    result = 0
+    defects = 0
     with tempfile.TemporaryDirectory() as folder:
         now = Path(folder) / "now"
         for name in chosen.decoders or decoders.DECODERS:
@@ -161,11 +161,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             process.start()
             process.join()
-            result += abs(code := process.exitcode or 0)
+            defects += abs(code := process.exitcode or 0)
             if code < 0:
                 end, path = signal.Signals(-code).name, keep(name, now.read_bytes())
                 print(f"{name}: ended by {end}; stored {path}")
-    return int(result > 0)
+    return int(defects > 0)
 
 
 if __name__ == "__main__":

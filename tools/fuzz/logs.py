@@ -64,13 +64,13 @@ def kept(path: Path) -> Case:
 
 def examine_all(numbers: range) -> int:
     """Examine broken logs; return how many break something."""
-    result = 0
+    defects = 0
     with tempfile.TemporaryDirectory() as folder:
         for number in numbers:
             if what := examine(number, Path(folder) / "log.mcap"):
-                result += 1
+                defects += 1
                 print(f"case {number}: {what}", flush=True)
-    return result
+    return defects
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,9 +83,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     end = chosen.first + chosen.cases
     shares = [range(chosen.first + job, end, chosen.jobs) for job in range(chosen.jobs)]
     with multiprocessing.get_context("fork").Pool(chosen.jobs) as pool:
-        result = sum(pool.map(examine_all, shares))
-    print(f"{chosen.cases} cases, {result} defects")
-    return int(result > 0)
+        defects = sum(pool.map(examine_all, shares))
+    print(f"{chosen.cases} cases, {defects} defects")
+    return int(defects > 0)
 
 
 if __name__ == "__main__":

@@ -76,15 +76,15 @@ def here(*words: object) -> Ran:
 def _instead(number: int, other: int) -> Iterator[None]:
     stream = sys.stdout if number == 1 else sys.stderr
     stream.flush()
-    remaining = os.dup(number)
+    saved = os.dup(number)
     os.dup2(other, number)
     try:
         yield
     finally:
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
-        os.dup2(remaining, number)
-        os.close(remaining)
+        os.dup2(saved, number)
+        os.close(saved)
 
 
 def must(*words: object, done: tuple[int, ...] = (0,)) -> Ran:
