@@ -1,7 +1,7 @@
 """Run the progress learner with each of its constants at half and at twice its value.
 
 constants.toml names the constants and the streams. Rows are stored in build/constants.json as they
-finish, so that a run that was stopped continues where it was.
+finish, so that an interrupted run continues if the commit is the same.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from unittest import mock
 
 from benchmarks.arena.judging import judge, run_learner
 from benchmarks.arena.streams import SETS, ArenaSource
-from benchmarks.report import save
+from benchmarks.report import commit, save
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.experiments.documents import write_json
@@ -110,9 +110,8 @@ def run_variant(source: ArenaSource, set_name: str, seed: int, variant: Variant)
     blocks = result["blocks"]
     if blocks is None and not SETS[set_name].get("goes_on"):
         blocks = FRAMES // config.tau
-    shown = list(value) if isinstance(value, tuple) else value
     counts = sum(learned), len(learned), result["noise learned"], result["twice"]
-    return [name, shown, set_name, seed, *counts, blocks]
+    return [name, as_json(value), set_name, seed, *counts, blocks]
 
 
 def cell(rows: list[Any]) -> str:
@@ -126,21 +125,21 @@ def summarize(rows: list[Any]) -> list[list[str]]:
     """Return the table: a line for each constant, after one for the unchanged learner."""
     unchanged = cell([row for row in rows if not row[0]])
     table = [["(all unchanged)", "", "", "", unchanged, unchanged]]
+    tried = list(variants())
     for entry in TABLE["constants"]:
         name = entry["name"]
-        tried = [value for constant, value in variants() if constant == name]
         cells = [entry["fixed"], ""] if "fixed" in entry else []
-        for value in tried:
-            same = [row for row in rows if row[0] == name and json_equal(row[1], value)]
+        for value in (value for constant, value in tried if constant == name):
+            same = [row for row in rows if row[:2] == [name, as_json(value)]]
             outcome = cell(same)
             cells.append(f"{written(value)}: {outcome if outcome != unchanged else 'no change'}")
         table.append([name, written(current(name)), entry["about"], entry["origin"], *cells])
     return table
 
 
-def json_equal(stored: Any, value: Any) -> bool:
-    """Return whether a value is that of a stored row, whose tuples are lists."""
-    return bool(stored == (list(value) if isinstance(value, tuple) else value))
+def as_json(value: Any) -> Any:
+    """Return a value as a row stores it: a list for a tuple."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def written(value: Any) -> str:
@@ -150,28 +149,31 @@ def written(value: Any) -> str:
     return "2 GiB" if value == 2**31 else f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
+def stored_rows(code: str) -> list[Any]:
+    """Return the rows of an interrupted run, without those that another commit measured."""
+    document = json.loads(PARTIAL.read_text("utf-8")) if PARTIAL.exists() else {}
+    return list(document["rows"]) if document.get("code") == code else []
+
+
 def main(quick: bool = False) -> None:
     """Run every variant on every set with every seed; quick: one set, one seed."""
     for name, entry in TABLE["sets"].items():
         SETS[name] = SETS.get(name, {}) | {"frames": FRAMES} | entry
-    sets, seeds = (
-        list(TABLE["sets"])[: 1 if quick else None],
-        TABLE["seeds"][: 1 if quick else None],
-    )
-    rows = json.loads(PARTIAL.read_text("utf-8"))["rows"] if PARTIAL.exists() else []
+    first = 1 if quick else None
+    sets, seeds = list(TABLE["sets"])[:first], TABLE["seeds"][:first]
+    code, tried = commit(), list(variants())
+    rows = stored_rows(code)
     for seed in seeds:
         for set_name in sets:
-            stored = [row[:2] for row in rows if row[2:4] == [set_name, seed]]
-            missing = [
-                (name, value)
-                for name, value in variants()
-                if not any(n == name and json_equal(v, value) for n, v in stored)
-            ]
+            finished = [row[:2] for row in rows if row[2:4] == [set_name, seed]]
+            missing = [(name, v) for name, v in tried if [name, as_json(v)] not in finished]
             source = ArenaSource(SETS[set_name]["words"], seed) if missing else None
             for variant in missing:
                 rows.append(run_variant(source, set_name, seed, variant))
                 print(*rows[-1], flush=True)
                 PARTIAL.parent.mkdir(exist_ok=True)
-                write_json(PARTIAL, {"rows": rows})
+                write_json(PARTIAL, {"code": code, "rows": rows})
     chosen = [row for row in rows if row[2] in sets and row[3] in seeds]
     save("constants", "The learner's constants", NOTE, [(HEADER, summarize(chosen)), (ROW, chosen)])
+    if not quick:
+        PARTIAL.unlink(missing_ok=True)

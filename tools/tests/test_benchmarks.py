@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import (
+    constants,
     converting,
     foreign,
     kernels,
@@ -65,3 +66,13 @@ def test_results_make_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     page = report.write_page().read_text(encoding="utf-8")
     assert "## Learning with many modules" in page
     assert "(results/modules.json)" in page
+
+
+def test_stored_rows_of_another_commit_are_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(constants, "PARTIAL", tmp_path / "constants.json")
+    assert constants.stored_rows("abc") == []
+    constants.PARTIAL.write_text('{"code": "abc", "rows": [["tau", 20]]}', encoding="utf-8")
+    assert constants.stored_rows("abc") == [["tau", 20]]
+    assert constants.stored_rows("abd") == []
