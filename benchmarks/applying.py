@@ -100,7 +100,7 @@ Rows = list[list[object]]
 
 
 def throughput(folder: Path, rounds: int) -> tuple[Rows, Rows]:
-    """Rows of a log and the outputs a module.
+    """Return two tables with a row for each log and number of outputs of a module.
 
     Returns:
         CPU microseconds a frame, of all threads; frames a second that are read by the wall's
@@ -153,7 +153,7 @@ def main(*, quick: bool = False) -> None:
         rounds = 2 if quick else 5
         cpu, wall = throughput(Path(place), rounds)
         late = latency(Path(place), 5 if quick else 30)
-    head = "log", "outputs a module"
+    head = "log", "outputs per module"
     forms = [f"to {form}" if form else "no output" for form in FORMS]
     save(
         "applying",
