@@ -55,18 +55,17 @@ PAGES = {
 SEARCH_WORDS = tomllib.loads(Path(__file__).with_name("search_words.toml").read_text("utf-8"))
 
 _folder = tempfile.TemporaryDirectory()
+RUNS = Path(_folder.name)
 
 
 def make_runs(app: Any) -> None:
-    """Make the runs that the gallery shows."""
-    demonstrations.make_runs(Path(_folder.name))
+    """Make the runs that the gallery shows, and with them its table."""
+    demonstrations.make_runs(RUNS)
+    generated.TABLES["index_of_logs"] = lambda: demonstrations.index_table(RUNS)
 
 
 def replace_tables(app: Any, name: str, text: list[str]) -> None:
     """Replace the lines {{ name }} of a page by tables that are made from the code."""
-    if name == "gallery":
-        table = demonstrations.index_table(Path(_folder.name))
-        text[0] = text[0].replace("{{ index_of_logs }}", table)
     text[0] = generated.replaced(text[0]).replace("../README.md)", "index.md)")
 
 
@@ -112,8 +111,8 @@ def name_levels(app: Any, page: str, template: str, context: dict[str, Any], tre
 def add_demonstrations(app: Any, failure: Exception | None) -> None:
     """Put the reports of the gallery, and one run in Rerun's viewer, beside the pages."""
     if failure is None:
-        demonstrations.add_reports(Path(_folder.name), Path(app.outdir))
-        demonstrations.add_viewer(Path(_folder.name), Path(app.outdir))
+        demonstrations.add_reports(RUNS, Path(app.outdir))
+        demonstrations.add_viewer(RUNS, Path(app.outdir))
 
 
 def setup(app: Any) -> None:

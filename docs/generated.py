@@ -11,7 +11,7 @@ import inspect
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -137,7 +137,7 @@ def _console(formatter: click.HelpFormatter) -> str:
     return f"```text\n{formatter.getvalue().rstrip()}\n```"
 
 
-TABLES: Mapping[str, Callable[..., str]] = {
+TABLES: dict[str, Callable[..., str]] = {
     "keys": keys,
     "exit_codes": exit_codes,
     "signals": signals,

@@ -1,6 +1,6 @@
 """Draw the images of these pages again: every tab of views, and tops of reports. `make images`.
 
-With names of images, only those; runs that are in build/images already are not learned again.
+With names of images, only those. Complete runs in build/images and build/gallery are used again.
 """
 
 from __future__ import annotations
@@ -94,7 +94,9 @@ def must(*words: str) -> None:
 def learned(name: str) -> Path:
     """Return the folder of a run, which is learned if it is missing."""
     if name.startswith("runs/"):
-        if not GALLERY.exists():
+        runs = [GALLERY / source for source, _ in REPORTS.values() if source.startswith("runs/")]
+        if not all((folder / "run.json").exists() for folder in runs):
+            shutil.rmtree(GALLERY, ignore_errors=True)
             GALLERY.mkdir(parents=True)
             demonstrations.make_runs(GALLERY)
         return GALLERY / name
