@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from sources import PRODUCT
 
 SNAPSHOT = Path(__file__).parent / "data" / "interface.json"
 
@@ -82,15 +83,22 @@ def documents() -> dict[str, list[str]]:
     return result
 
 
+def command_of(name: str) -> click.Command:
+    """Return a command of the program."""
+    from cdmisfa.cli.app import cli
+
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    return command
+
+
 def commands() -> dict[str, list[str]]:
     """Arguments and options of each command."""
-    from cdmisfa.cli.app import COMMANDS, cli
+    from cdmisfa.cli.app import COMMANDS
 
-    context = click.Context(cli)
     result = {}
     for name in COMMANDS:
-        command = cli.get_command(context, name)
-        assert command is not None
+        command = command_of(name)
         result[name] = [
             p.human_readable_name for p in command.params if isinstance(p, click.Argument)
         ]
@@ -109,7 +117,7 @@ def names() -> dict[str, list[str]]:
             continue
         thing = getattr(cdmisfa, name)
         if inspect.isclass(thing):
-            ours = [kind for kind in thing.__mro__ if kind.__module__.split(".")[0] in OURS]
+            ours = [kind for kind in thing.__mro__ if kind.__module__.split(".")[0] in PRODUCT]
             members = {member for kind in ours for member in vars(kind)}
             members |= {member for kind in ours for member in getattr(kind, "__annotations__", ())}
             result[name] = sorted(
@@ -120,9 +128,6 @@ def names() -> dict[str, list[str]]:
         else:
             result[name] = []
     return result
-
-
-OURS = ("cdmisfa", "recorder", "replay")
 
 
 def configuration() -> list[str]:

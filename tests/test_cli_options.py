@@ -10,18 +10,13 @@ from pathlib import Path
 import click
 import pytest
 from conftest import Cdmisfa
+from interface import command_of
 from waiting import python
 
 from cdmisfa.cli import options
 from cdmisfa.cli.app import COMMANDS, cli
 from cdmisfa.cli.commands.learn import learn_command
 from recorder.images.options import OPTIONS, InputConfig, InputOptions
-
-
-def command_of(name: str) -> click.Command:
-    command = cli.get_command(click.Context(cli), name)
-    assert command is not None
-    return command
 
 
 def options_of(name: str) -> list[click.Option]:

@@ -6,11 +6,10 @@ import ast
 import re
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import pytest
+from sources import ROOT, files, name, tree
 
-ROOT = Path(__file__).parents[1]
 PAGE = "docs/project/contributing.md"
 EQUATIONS = [str(number) for number in range(1, 10)] + [f"P{number}" for number in range(1, 5)]
 """The paper's equations, and the progress learner's."""
@@ -30,17 +29,15 @@ def stated() -> list[tuple[str, Place]]:
 
 
 def _stated() -> Iterator[tuple[str, Place]]:
-    for package in ("cdmisfa", "recorder", "replay"):
-        for file in sorted((ROOT / package).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text("utf-8"))):
-                if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
-                    name = getattr(node, "name", "")
-                    for text in LINE.findall(ast.get_docstring(node) or ""):
-                        yield text.strip(), (file.relative_to(ROOT).as_posix(), name)
-    for file in sorted((ROOT / "cdmisfa/kernels").glob("*.c")):
-        for comment, name in IN_C.findall(file.read_text("utf-8")):
+    for file in files():
+        for node in ast.walk(tree(file)):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module):
+                for text in LINE.findall(ast.get_docstring(node) or ""):
+                    yield text.strip(), (name(file), getattr(node, "name", ""))
+    for file in files("cdmisfa/kernels", suffixes=(".c",)):
+        for comment, function in IN_C.findall(file.read_text("utf-8")):
             for text in LINE.findall(comment.replace("\n *", "\n")):
-                yield text.strip(), (file.relative_to(ROOT).as_posix(), name)
+                yield text.strip(), (name(file), function)
 
 
 def stated_by_number() -> dict[str, set[Place]]:
@@ -66,6 +63,6 @@ def test_equations_are_functions() -> None:
 
 def test_the_page_says_where_every_equation_is() -> None:
     listed: dict[str, set[Place]] = {}
-    for number, file, name in ROW.findall((ROOT / PAGE).read_text("utf-8")):
-        listed.setdefault(number, set()).add((file, name))
+    for number, file, function in ROW.findall((ROOT / PAGE).read_text("utf-8")):
+        listed.setdefault(number, set()).add((file, function))
     assert listed == stated_by_number()

@@ -12,16 +12,11 @@ from pathlib import Path
 
 import click
 import pytest
+from interface import command_of
+from sources import DOCUMENTS, files, name, strings, tree
 
 from cdmisfa.cli.app import COMMANDS, cli
 from replay.logs.formats.arrays import RECIPE as ARRAYS_RECIPE  # runs store it: it cannot change
-
-ROOT = Path(__file__).parents[1]
-PRODUCT = ("cdmisfa", "recorder", "replay")
-DOCUMENTS = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
-    *(ROOT / "docs").rglob("*.md"),
-]
 
 # Pages that a script writes or that list decisions in a sentence each.
 NOT_COUNTED = ("benchmarks.md", "decisions.md")
@@ -69,20 +64,8 @@ def banned(text: str) -> list[str]:
     ]
 
 
-def sources() -> Iterator[ast.Module]:
-    for package in PRODUCT:
-        for file in sorted((ROOT / package).rglob("*.py")):
-            yield ast.parse(file.read_text("utf-8"), str(file.relative_to(ROOT)))
-
-
-def strings(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield node.value
-
-
-def defined_names(tree: ast.AST) -> Iterator[str]:
-    for node in ast.walk(tree):
+def defined_names(module: ast.AST) -> Iterator[str]:
+    for node in ast.walk(module):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.arg):
@@ -106,13 +89,18 @@ def hand_written() -> Iterator[Path]:
 
 
 def test_few_constructions_are_vague() -> None:
-    trees = list(sources())
+    modules = [tree(file) for file in files()]
     counts = {
         "strings": sum(
-            len(VAGUE.findall(text)) for tree in trees for text in strings(tree) if len(text) > 20
+            len(VAGUE.findall(text))
+            for module in modules
+            for text in strings(module)
+            if len(text) > 20
         ),
         "names": sum(
-            len(VAGUE_NAME.findall(name.lower())) for tree in trees for name in defined_names(tree)
+            len(VAGUE_NAME.findall(defined.lower()))
+            for module in modules
+            for defined in defined_names(module)
         ),
         "documents": sum(len(VAGUE.findall(page.read_text("utf-8"))) for page in DOCUMENTS),
     }
@@ -124,7 +112,7 @@ def test_pages_are_short() -> None:
     assert words <= WORDS_OF_DOCUMENTS
 
 
-@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", DOCUMENTS, ids=name)
 def test_pages_use_the_words_of_the_field(page: Path) -> None:
     assert banned(prose(page.read_text("utf-8"))) == []
 
@@ -132,9 +120,8 @@ def test_pages_use_the_words_of_the_field(page: Path) -> None:
 def test_help_uses_the_words_of_the_field() -> None:
     texts = [cli.get_help(click.Context(cli))]
     texts += [
-        command.get_help(click.Context(command, info_name=name))
-        for name in COMMANDS
-        if (command := cli.get_command(click.Context(cli), name))
+        (command := command_of(word)).get_help(click.Context(command, info_name=word))
+        for word in COMMANDS
     ]
     assert len(texts) == len(COMMANDS) + 1
     assert [problem for text in texts for problem in banned(text)] == []
@@ -143,13 +130,13 @@ def test_help_uses_the_words_of_the_field() -> None:
 def test_messages_use_the_words_of_the_field() -> None:
     """Strings of several words that are no docstrings are messages, as a rule."""
     problems = []
-    for tree in sources():
+    for module in map(tree, files()):
         docstrings = {
             ast.get_docstring(node, clean=False)
-            for node in ast.walk(tree)
+            for node in ast.walk(module)
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         }
-        for text in strings(tree):
+        for text in strings(module):
             if " " in text and text not in docstrings and text != ARRAYS_RECIPE:
                 problems += banned(text)
     assert problems == []

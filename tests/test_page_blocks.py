@@ -15,9 +15,8 @@ from typing import Any
 
 import pytest
 from conftest import Cdmisfa
+from sources import DOCS, README, ROOT, name
 
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(console|sh|python|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 # Packages without which the code of a page cannot run.
@@ -37,7 +36,7 @@ IN_A_CHECKOUT = ("README", "first-run", "own-logs", "record", "look-at-a-run", "
 
 
 def with_blocks() -> list[Path]:
-    return [page for page in PAGES if BLOCK.search(page.read_text("utf-8"))]
+    return [page for page in (README, *DOCS) if BLOCK.search(page.read_text("utf-8"))]
 
 
 def missing_packages(text: str) -> list[str]:
@@ -110,7 +109,7 @@ class Page:
                 assert code == 0 or set(output.split()) != {"..."}, f"{line}: {printed}"
 
 
-@pytest.mark.parametrize("page", with_blocks(), ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", with_blocks(), ids=name)
 def test_blocks_of_a_page_work_as_printed(
     page: Path, cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -156,7 +155,7 @@ def test_a_block_that_differs_fails(cdmisfa: Cdmisfa, monkeypatch: pytest.Monkey
 
 def test_first_block_of_the_readme_has_the_two_targets_of_the_makefile() -> None:
     makefile = (ROOT / "Makefile").read_text("utf-8")
-    first = re.findall(r"^```\w*\n(.*?)^```$", PAGES[0].read_text("utf-8"), re.M | re.S)[0]
+    first = re.findall(r"^```\w*\n(.*?)^```$", README.read_text("utf-8"), re.M | re.S)[0]
     targets = re.findall(r"^(?:\$ )?make (\w+)", first, re.MULTILINE)
     assert targets == ["demo", "test"]
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)

@@ -7,20 +7,14 @@ import runpy
 from pathlib import Path
 
 import pytest
+from sources import DOCUMENTS, ROOT, name
 
-ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
 MOST_BYTES = 400_000
-PAGES = sorted(
-    [
-        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
-        *(ROOT / "docs").rglob("*.md"),
-        *(ROOT / ".github").rglob("*.*"),
-    ]
-)
+PAGES = sorted([*DOCUMENTS, *(ROOT / ".github").rglob("*.*")])
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=name)
 def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\((?!https?://)([^)#\s]+)", page.read_text("utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
@@ -30,7 +24,7 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     "page",
     # a decision record keeps the paths of its day
     [page for page in PAGES if page.parent.name != "decisions"],
-    ids=lambda page: str(page.relative_to(ROOT)),
+    ids=name,
 )
 def test_files_that_a_page_names_are_there(page: Path) -> None:
     text = page.read_text("utf-8")

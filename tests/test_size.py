@@ -8,8 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-PRODUCT = ("cdmisfa", "recorder", "replay")
+from sources import PRODUCT, ROOT, files, name, tree
 
 CEILINGS = {
     "benchmarks": 3060,
@@ -51,10 +50,7 @@ NAMES_DEFINED_TWICE = 2
 
 def sources(*folders: str) -> Iterator[Path]:
     """Yield every Python and C file below `folders`."""
-    for folder in folders:
-        for file in sorted((ROOT / folder).rglob("*")):
-            if file.suffix in (".py", ".c", ".h") and "build" not in file.parts:
-                yield file
+    return files(*folders, suffixes=(".py", ".c", ".h"))
 
 
 def package_of(file: Path) -> str:
@@ -75,7 +71,7 @@ def code_lines(file: Path) -> set[int]:
         if line.strip() and not line.strip().startswith(comment)
     }
     if file.suffix == ".py":
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.walk(tree(file)):
             if (
                 isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
                 and ast.get_docstring(node, clean=False) is not None
@@ -100,31 +96,27 @@ def test_folders_files_and_functions_stay_small() -> None:
     folders = Counter(file.parent for file in sources(*PRODUCT) if code_lines(file))
     assert {str(f): n for f, n in folders.items() if n > FILES_IN_A_FOLDER} == {}
     long = {}
-    for file in sources(*PRODUCT):
-        if file.suffix != ".py":
-            continue
-        text = file.read_text("utf-8")
-        if (lines := len(text.splitlines())) > LINES_OF_A_FILE:
-            long[str(file.relative_to(ROOT))] = lines
+    for file in files():
+        if (lines := len(file.read_text("utf-8").splitlines())) > LINES_OF_A_FILE:
+            long[name(file)] = lines
         code = code_lines(file)
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.walk(tree(file)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 body = code & set(range(node.lineno, (node.end_lineno or 0) + 1))
                 if len(body) > LINES_OF_A_FUNCTION:
-                    long[f"{file.relative_to(ROOT)}: {node.name}"] = len(body)
+                    long[f"{name(file)}: {node.name}"] = len(body)
     assert long == {}
 
 
 def test_few_public_names_are_defined_in_two_modules() -> None:
     places = defaultdict(set)
-    for file in sources(*PRODUCT):
-        if file.suffix == ".py":
-            for node in ast.parse(file.read_text("utf-8")).body:
-                if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-                    places[node.name].add(str(file.relative_to(ROOT)))
+    for file in files():
+        for node in tree(file).body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                places[node.name].add(name(file))
     twice = {
-        name: sorted(files)
-        for name, files in places.items()
-        if len(files) > 1 and not name.startswith("_")
+        defined: sorted(modules)
+        for defined, modules in places.items()
+        if len(modules) > 1 and not defined.startswith("_")
     }
     assert len(twice) <= NAMES_DEFINED_TWICE, twice

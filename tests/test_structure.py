@@ -7,12 +7,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
+from sources import PRODUCT, ROOT
 from waiting import python
 
 from cdmisfa.cli.app import COMMANDS
-
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("cdmisfa", "recorder", "replay")
 
 
 def inits(package: str) -> list[Path]:
@@ -74,9 +72,9 @@ def test_imports_run_one_way_and_never_in_a_circle() -> None:
 
 def test_every_room_has_forbidden_imports_that_the_rules_catch(tmp_path: Path) -> None:
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    for package in PACKAGES:
+    for package in PRODUCT:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.pyc"))
-    rooms = {".".join(f.parent.relative_to(ROOT).parts) for p in PACKAGES for f in inits(p)}
+    rooms = {".".join(f.parent.relative_to(ROOT).parts) for p in PRODUCT for f in inits(p)}
     assert rooms == set(FORBIDDEN)
     probes = []
     for room, targets in FORBIDDEN.items():

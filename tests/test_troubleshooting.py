@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import ast
 import re
 from functools import cache
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from sources import ROOT, files, strings, tree
 
-ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "troubleshooting.md").read_text("utf-8")
 TEXTS = "".join(re.findall(r"^```text\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)).splitlines()
 OURS = [line.partition(": ")[2] for line in TEXTS if line.startswith("cdmisfa: ")]
@@ -19,13 +18,9 @@ OURS += re.findall(r"^\| `([^`]+)` \|", PAGE, re.MULTILINE)
 
 @cache
 def literals() -> set[str]:
-    """Return all texts of the program; those of an f-string are the parts between its values."""
-    files = [
-        file for top in ("cdmisfa", "recorder", "replay") for file in (ROOT / top).rglob("*.py")
-    ]
-    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
-    texts = [node.value for node in nodes if isinstance(node, ast.Constant)]
-    return {text.strip() for text in texts if isinstance(text, str) and len(text.strip()) > 5}
+    """Return the strings of the program."""
+    texts = (text.strip() for file in files() for text in strings(tree(file)))
+    return {text for text in texts if len(text) > 5}
 
 
 @pytest.mark.parametrize("text", OURS)
