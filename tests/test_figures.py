@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from benchmarks.estimators import WHITENED
+from benchmarks.report import RESULTS as BENCHMARKS
 
 ROOT = Path(__file__).parents[1]
 EVIDENCE = ROOT / "docs" / "evidence"
 DATA = EVIDENCE / "data"
-RESULTS_OF_BENCHMARKS = ROOT / "benchmarks" / "results"
 
 
 def load(name: str) -> Any:
@@ -24,7 +24,7 @@ def load(name: str) -> Any:
 
 
 def benchmark(name: str) -> Any:
-    return json.loads((RESULTS_OF_BENCHMARKS / f"{name}.json").read_text("utf-8"))
+    return json.loads((BENCHMARKS / f"{name}.json").read_text("utf-8"))
 
 
 def arena(learner: str, *sets: str) -> list[Any]:
@@ -267,7 +267,7 @@ def numbers(value: Any) -> Iterator[float]:
 
 
 def test_claims_of_the_paper_have_figures_of_their_data() -> None:
-    checked = 0
+    checked = []
     for row in rows(EVIDENCE / "paper.md"):
         if len(row) == 4 and (link := re.search(r"\]\(data/(\w+)\.json\)", row[3])):
             stored = list(numbers(load(link[1])))
@@ -275,8 +275,10 @@ def test_claims_of_the_paper_have_figures_of_their_data() -> None:
             for number in re.findall(r"-?\d+(?:\.\d+)?", text):
                 digits = len(number.partition(".")[2])
                 assert any(round(x, digits) == float(number) for x in stored), (row[0], number)
-                checked += 1
-    assert checked > 50
+                checked.append(number)
+    assert len(checked) > 50
+    # A whole number of one or two digits agrees with some stored number nearly always.
+    assert sum("." in number or abs(float(number)) >= 100 for number in checked) > 35
 
 
 def test_tables_of_the_learners_are_those_of_their_data() -> None:
