@@ -35,8 +35,8 @@ VAGUE_NAME = re.compile(
     r"(?:^|_)(?:told|said|stood|stands|anew|own|gone|came|became|others|of_old|begun|known_as"
     r"|asked|held|kept|shown|found|there|heard)(?:_|$)"
 )
-CEILINGS = {"strings": 75, "names": 60, "documents": 20}
-WORDS_OF_DOCUMENTS = 25_000
+CEILINGS = {"strings": 42, "names": 26, "documents": 8}
+WORDS_OF_DOCUMENTS = 24_000
 
 # Words that texts for users do not use, and the words that they use instead.
 INSTEAD = {
