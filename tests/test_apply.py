@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
-from applied_data import SIZE, TAU, camera, make_run
+from applied_data import SIZE, TAU, camera, learned, make_run
 from camera_files import pictures
 from conftest import Cdmisfa
 from folders import external
@@ -22,6 +23,7 @@ from cdmisfa import Run
 from cdmisfa.experiments.apply import Application
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
+from replay.runs.modules import save_modules
 
 
 @pytest.fixture
@@ -48,11 +50,52 @@ def test_a_table_has_the_bits_of_transform(
     for module in Run(run).modules:
         np.testing.assert_array_equal(outputs(table, module.index), module.transform(shown))
     assert np.unique(table["log_time"].to_numpy()).size == count
-    for name in ("module1_novelty", "module2_slowness0"):
+    for name in ("module1_novelty", "module2_block_slowness0"):
         each = np.array(table[name].to_pylist(), float)
         starts = [0, *(np.flatnonzero(np.diff(table["t"].to_numpy() // TAU)) + 1)]
         assert all(len(set(part[:5])) == 1 for part in np.split(each, starts[1:]))
     assert table["module1_novelty"].null_count == (count == 21)  # a block of one frame
+
+
+@pytest.mark.parametrize("gap", [0, 3])
+def test_the_printed_numbers_follow_from_the_table(
+    gap: int, run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log, out = camera(tmp_path / "a.mcap", 90, gap=gap), tmp_path / "o.parquet"
+    (result,) = cdmisfa("apply", run, log, "-o", out, "--json").json["logs"]
+    table = pq.read_table(out).to_pandas()
+    parts = np.flatnonzero(np.diff(table["t"] // TAU)) + 1
+    for printed, module in zip(result["modules"], Run(run).modules, strict=True):
+        name, eta = f"module{module.index}", float(module.eta[0])
+        y, t = table[f"{name}_y0"].to_numpy(), table["t"].to_numpy()
+        steps = np.diff(y)[np.diff(t) == 1]
+        whole = np.sqrt((steps**2).mean() / y.var()) / (2 * np.pi)
+        assert printed["slowness"] == pytest.approx(whole, rel=1e-9)
+        assert printed["alive"] == pytest.approx(table[f"{name}_alive"].mean())
+        novelty = table[f"{name}_novelty"]
+        assert printed["explained"] == pytest.approx((novelty <= 1)[novelty.notna()].mean())
+        ends, squares = [*parts.tolist(), len(y)], []
+        for low, high in zip([0, *parts.tolist()], ends, strict=True):
+            squares += [(np.diff(y[low:high]) ** 2).mean()] * (high - low)
+            mean, power, moved = y[:high].mean(), (y[:high] ** 2).mean(), np.mean(squares)
+            slowness = np.sqrt(moved / (power - mean**2)) / (2 * np.pi)
+            speed = max(
+                abs(np.log(np.sqrt(moved) / (2 * np.pi * eta))), abs(np.log(slowness / eta))
+            )
+            expected = max(abs(np.log10(power)), speed / 0.8)
+            np.testing.assert_allclose(novelty[low:high], expected, rtol=1e-9)
+
+
+def test_a_covered_camera_is_novel(run: Path, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    for name, band in (("progress", np.nan), ("2.0", 0.01)):
+        modules = [replace(learned(1), band_sd=np.full(3, band))]
+        save_modules(run / "modules.npz", modules)
+        out = tmp_path / f"{name}.parquet"
+        np.save(tmp_path / "dark.npy", np.full((60, *SIZE), 7, np.uint8))
+        done = cdmisfa("apply", run, tmp_path / "dark.npy", "--rate", 30, "-o", out, "--json")
+        assert done.json["logs"][0]["modules"][0]["explained"] == 0.0, done.err
+        assert done.json["logs"][0]["modules"][0]["slowness"] is None
+        assert (pq.read_table(out)["module1_novelty"].to_numpy() > 1).all()
 
 
 def test_an_mcap_has_a_topic_a_module_beside_the_frames(
@@ -95,10 +138,10 @@ def test_a_view_has_the_outputs_beside_the_pictures(
             np.array(view.rows[f"/outputs/1_cam/{i}"]["frame"])[there].tolist() == frames.tolist()
         )
     begins = [a.block.t for a in applied]
-    for name in ("slowness", "novelty"):
+    for name in ("block_slowness", "novelty"):
         reported = view.rows[f"/{name}/1_cam"]
         values = dict(zip(reported["frame"], scalars(reported).tolist(), strict=True))
-        columns = [0, 3] if name == "slowness" else [0, 1]
+        columns = [0, 3] if name == "block_slowness" else [0, 1]
         assert [values[t] for t in begins] == [getattr(a, name)[columns].tolist() for a in applied]
     assert view.rows["/views/1_cam"]["frame"] == [t for t in frames.tolist() if t % 10 == 0]
 
@@ -119,7 +162,7 @@ def test_what_is_applied_does_not_depend_on_where_the_frames_come_from(
     assert [len(one.block) for one in result[0]] == [TAU] * 7 + [10]
     for each in zip(*result, strict=True):
         for one in each[1:]:
-            for name in ("y", "slowness", "alive", "novelty"):
+            for name in ("y", "block_slowness", "alive", "novelty"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(each[0], name))
 
 
@@ -141,8 +184,8 @@ def test_lines_come_block_by_block_and_are_those_of_what_was_recorded(
         assert line["log_time"] == source.spec.time_ns(applied.block.t)
         y = np.concatenate([module["y"] for module in line["modules"]], axis=1)
         np.testing.assert_array_equal(y, applied.y)
-        slowness = np.concatenate([module["slowness"] for module in line["modules"]])
-        np.testing.assert_array_equal(slowness, applied.slowness)
+        slowness = np.concatenate([module["block_slowness"] for module in line["modules"]])
+        np.testing.assert_array_equal(slowness, applied.block_slowness)
         assert [module["novelty"] for module in line["modules"]] == applied.novelty.tolist()
         assert [module["alive"] for module in line["modules"]] == applied.alive.tolist()
 

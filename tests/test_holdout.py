@@ -71,6 +71,11 @@ def test_frames_held_out_are_not_learned_from_and_judged_as_batch_sfa_is(
     )
     np.testing.assert_allclose(reported["of_batch"], batch, rtol=1e-6)
     assert cdmisfa("info", run, "--json").json["held_out"] == result["held_out"]
+    ((applied,),) = (
+        log["modules"]
+        for log in cdmisfa("apply", run, log, *LEARN[:2], "--start", "54", "--json").json["logs"]
+    )
+    assert applied["slowness"] == pytest.approx(reported["slowness"][0], rel=1e-12)
     lines = cdmisfa("info", run).out.splitlines()
     own, theirs = (", ".join(f"{v:.4f}" for v in reported[k]) for k in ("slowness", "of_batch"))
     at = lines.index("slowness on the held-out frames 5400 to 5999:")

@@ -19,14 +19,17 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa import kernels
-from cdmisfa.agents.progress.candidate import log_ratio
-from cdmisfa.agents.progress.decisions import CHANGED_SLOWNESS_LOG, MODULE_VARIANCE_BOUNDS
+from cdmisfa.agents.progress import decisions
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.learner import MIN_TEST_BLOCKS
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.names import kind_of_frames
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
+from cdmisfa.features.following import SlownessSums
+from cdmisfa.features.outputs import slowness_by_moments
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.words import is_live, open_live
 from recorder.images.framing import Recipe
@@ -44,10 +47,6 @@ from replay.stored_source import StoredSource, centre_as
 # Standard deviations of its slowness within which a module of 1.0 and 2.0 explains a block, as in
 # the paper and in `gate.c`.
 EXPLAINED_WITHIN_SD: Final = 2.0
-
-# Exponential window, in frames, of the variance that decides whether a module is alive. It equals
-# the default of `learner.test_frames`, so that a module is judged as it was when it was saved.
-VARIANCE_WINDOW: Final = 2000
 
 # Approximate size in bytes of the frames and outputs that are read at once from a log. A larger
 # value takes more memory; the speed did not rise further.
@@ -79,7 +78,11 @@ class Application:
         self.modules = run.modules
         if not self.modules:
             raise UsageError(f"{path} has no modules: learn longer, or name another run")
-        self.tau = int(run.header.manifest["config"]["learner"]["tau"])
+        learner = run.header.manifest["config"]["learner"]
+        self.tau = int(learner["tau"])
+        # A module is judged over the window in which the learner tested it before its save.
+        test_frames = int(learner.get("test_frames", ProgressConfig().test_frames))
+        self._window = max(test_frames, MIN_TEST_BLOCKS * self.tau)
         self._stack = Stack(self.modules)
         self.recipe = self.modules[0].recipe or Recipe(run.header.spec.frame_shape)
         self._folder = run.log.parent
@@ -177,7 +180,7 @@ class Application:
         """
         stored = isinstance(source, StoredSource)
         reads = _reads(source, self._step(source.spec) if stored else self.tau, self.tau, frames)
-        trackers = [_ModuleTracker(self.modules) for _ in source.spec.streams]
+        trackers = [_ModuleTracker(self.modules, self._window) for _ in source.spec.streams]
         for parts in self._ahead(reads) if stored else map(self._projected, reads):
             for part, y in sorted(parts, key=lambda part: (part[0].t, part[0].stream)):
                 yield trackers[part.stream].update(part, y)
@@ -264,46 +267,45 @@ def _read_rest(source: FrameSource) -> Sequence[Block]:
 class _ModuleTracker:
     """Running statistics of the modules on one stream: whether they are alive, and novelty.
 
-    The novelty of a block is 1 at the bound of what the learner counts as explained by the module.
-    For modules of 1.0 and 2.0 that is the band of their slowness. For those of the progress learner
-    it is |ln| of the ratio of the mean step of the first output to its step while learning (its
-    variance was 1 then).
+    A module explains a block if the novelty is at most 1, the bound of the learner. For modules of
+    1.0 and 2.0 that is the band of the slowness within the block, as in `gate.c`. For those of the
+    progress learner it is `decisions.novelty` of the first output, over the window of its tests
+    and relative to training, where its variance was 1 and its slowness eta.
     """
 
-    def __init__(self, modules: Sequence[Module]) -> None:
+    def __init__(self, modules: Sequence[Module], window: int) -> None:
+        self._window = window
         self._firsts = [columns.start for _, columns in columns_of(modules)]
         self._centre = np.concatenate([module.band_mean for module in modules])
         self._width = EXPLAINED_WITHIN_SD * np.concatenate([module.band_sd for module in modules])
-        self._step_sizes = {
-            i: 2 * math.pi * float(module.eta[0])
+        self._etas = {
+            i: float(module.eta[0])
             for i, module in enumerate(modules)
             if not np.isfinite(module.band_sd).all()
         }
-        self._mean = np.zeros(len(modules))
-        self._square = np.zeros(len(modules))
+        self._moments = np.zeros((3, len(modules)))
         self._frames = 0
 
     def update(self, block: Block, y: FloatArray) -> Applied:
         """Return the outputs (n, R) on a block with their slowness, liveness and novelty."""
-        slowness = np.full(y.shape[1], np.nan)
+        slowness, novelty = np.full(y.shape[1], np.nan), np.full(len(self._firsts), np.nan)
         if len(y) > 1:
-            slowness = kernels.instantaneous_slowness(y)
-        first = y[:, self._firsts]
-        self._frames += len(y)
-        window = VARIANCE_WINDOW
-        rate = max(min(2 * len(y) / (window + len(y)), 1.0), len(y) / self._frames)
-        self._mean += rate * (first.mean(axis=0) - self._mean)
-        self._square += rate * ((first * first).mean(axis=0) - self._square)
-        variance = self._square - self._mean * self._mean
-        alive = (MODULE_VARIANCE_BOUNDS[0] < variance) & (variance < MODULE_VARIANCE_BOUNDS[1])
-        distance = np.abs(slowness - self._centre) / self._width
-        novelty = np.maximum.reduceat(distance, self._firsts)
-        if self._step_sizes and len(y) > 1:
-            steps = np.diff(first, axis=0)
-            sizes = np.sqrt((steps * steps).mean(axis=0)).tolist()
-            for i, learned in self._step_sizes.items():
-                novelty[i] = abs(log_ratio(sizes[i], learned)) / CHANGED_SLOWNESS_LOG
-        return Applied(block, y, slowness, alive, novelty)
+            slowness, first = kernels.instantaneous_slowness(y), y[:, self._firsts]
+            squares = [first * first, np.diff(first, axis=0) ** 2]
+            self._frames += len(y)
+            rate = max(min(2 * len(y) / (self._window + len(y)), 1.0), len(y) / self._frames)
+            now = np.stack([values.mean(axis=0) for values in (first, *squares)])
+            self._moments += rate * (now - self._moments)
+            distance = np.abs(slowness - self._centre) / self._width
+            novelty = np.maximum.reduceat(distance, self._firsts)
+        mean, power, steps = self._moments
+        variance = power - mean * mean
+        low, high = decisions.MODULE_VARIANCE_BOUNDS
+        for i, eta in self._etas.items() if len(y) > 1 else ():
+            ratio = steps[i] / (2 * math.pi * eta) ** 2
+            relative = slowness_by_moments(steps[i], variance[i]) / eta
+            novelty[i] = decisions.novelty(power[i], ratio, relative)
+        return Applied(block, y, slowness, (low < variance) & (variance < high), novelty)
 
 
 class Totals:
@@ -324,34 +326,46 @@ class Totals:
         self._spec, self._modules = spec, modules
         self._firsts = [columns.start for _, columns in columns_of(modules)]
         self._sums: dict[int, FloatArray] = {}
+        self._slowness: dict[int, SlownessSums] = {}
+        self._ends: dict[int, int] = {}
 
     def add(self, applied: Applied) -> None:
         """Add a block."""
-        count = len(applied.block)
+        block, stream, count = applied.block, applied.block.stream, len(applied.block)
         self.frames += count
-        sums = self._sums.setdefault(applied.block.stream, np.zeros((5, len(self._modules))))
-        slowness = applied.slowness[self._firsts]
-        finite = np.isfinite(slowness)
+        sums = self._sums.setdefault(stream, np.zeros((4, len(self._modules))))
         sums[0] += count
         sums[1] += count * applied.alive
-        sums[2] += count * (applied.alive & (applied.novelty < 1))
-        sums[3] += count * np.where(finite, slowness, 0)
-        sums[4] += count * finite
+        sums[2] += count * ~np.isnan(applied.novelty)
+        sums[3] += count * (applied.novelty <= 1)
+        gap = block.t != self._ends.get(stream)
+        self._slowness.setdefault(stream, SlownessSums(len(self._firsts))).add(
+            applied.y[:, self._firsts], gap
+        )
+        self._ends[stream] = block.t + count
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return shares of frames and mean slowness for each stream and module, as JSON values."""
+        """Return slowness and shares of frames for each stream and module, as JSON values.
+
+        `slowness` is that of the first output over all frames, as `learn` measures it on held-out
+        frames. `alive` is a share of all frames, and `explained` the share of the frames with a
+        novelty on which it is at most 1; a value that does not exist is None.
+        """
         return [
             {
                 "stream": self._spec.streams[stream],
                 "module": module.index,
                 "frames": int(frames),
-                "slowness": slowness / counted if counted else None,
+                "slowness": slowness if math.isfinite(slowness) else None,
                 "alive": alive / frames,
-                "known": known / frames,
+                "explained": explained / judged if judged else None,
             }
             for stream, sums in sorted(self._sums.items())
-            for module, (frames, alive, known, slowness, counted) in zip(
-                self._modules, sums.T.tolist(), strict=True
+            for module, slowness, (frames, alive, judged, explained) in zip(
+                self._modules,
+                self._slowness[stream].slowness.tolist(),
+                sums.T.tolist(),
+                strict=True,
             )
         ]
 

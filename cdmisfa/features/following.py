@@ -69,6 +69,45 @@ def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) ->
     return BatchOutputs((rotation[:, :outputs].T * scale) @ directions, state.mean, directions)
 
 
+class SlownessSums:
+    """Sums from which the slowness of outputs over all frames follows, added piece by piece.
+
+    Args:
+        outputs: number of outputs J.
+    """
+
+    def __init__(self, outputs: int) -> None:
+        self._count = self._steps = 0
+        self._origin, self._total, self._squares, self._moved = np.zeros((4, outputs))
+        self._last: FloatArray | None = None
+
+    def add(self, y: FloatArray, gap: bool) -> None:
+        """Add the outputs (n, J) on the next frames; `gap`: frames are missing before them."""
+        if self._last is None:
+            self._origin = y[
+                0
+            ]  # so that a constant has no variance and a large mean costs no digit
+        before = y[:0] if gap or self._last is None else self._last[None]
+        change, apart = np.diff(np.concatenate([before, y]), axis=0), y - self._origin
+        self._count, self._steps, self._last = (
+            self._count + len(y),
+            self._steps + len(change),
+            y[-1],
+        )
+        self._total += apart.sum(axis=0)
+        self._squares += (apart * apart).sum(axis=0)
+        self._moved += (change * change).sum(axis=0)
+
+    @property
+    def slowness(self) -> FloatArray:
+        """(J,) cycles a frame, infinite for a constant output, NaN if no frame follows another."""
+        if not self._steps:
+            return np.full(len(self._total), np.nan)
+        variance = self._squares / self._count - (self._total / self._count) ** 2
+        moments = zip(self._moved / self._steps, variance, strict=True)
+        return np.array([slowness_by_moments(d, v) for d, v in moments])
+
+
 def following_slowness(
     pieces: Pieces, features: Sequence[tuple[FloatArray, FloatArray]]
 ) -> list[FloatArray]:
@@ -84,19 +123,7 @@ def following_slowness(
     """
     phi = np.concatenate([phi for phi, _ in features])
     offset = np.concatenate([kernels.mean_output(phi, mean) for phi, mean in features])
-    count, steps = 0, 0
-    total, squares, moved = (np.zeros(len(phi)) for _ in range(3))
-    last: FloatArray | None = None
+    sums = SlownessSums(len(phi))
     for x, gap in pieces:
-        y = kernels.outputs(phi, offset, x)
-        before = y[:0] if gap or last is None else last[None]
-        change = np.diff(np.concatenate([before, y]), axis=0)
-        count, steps, last = count + len(y), steps + len(change), y[-1]
-        total += y.sum(axis=0)
-        squares += (y * y).sum(axis=0)
-        moved += (change * change).sum(axis=0)
-    if not steps:
-        return [np.full(len(phi), np.nan) for phi, _ in features]
-    variance = squares / count - (total / count) ** 2
-    slow = [slowness_by_moments(d, v) for d, v in zip(moved / steps, variance, strict=True)]
-    return np.split(np.array(slow), np.cumsum([len(phi) for phi, _ in features[:-1]]))
+        sums.add(kernels.outputs(phi, offset, x), gap)
+    return np.split(sums.slowness, np.cumsum([len(phi) for phi, _ in features[:-1]]))

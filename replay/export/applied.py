@@ -34,9 +34,15 @@ _, OUTPUT_DEFINITION = define_message(
     "module_output",
     [
         ("y", 1, _FIELD.TYPE_DOUBLE, True, "Outputs on the frame, the slowest first"),
-        ("slowness", 2, _FIELD.TYPE_DOUBLE, True, "Of each within the block, 1/frame"),
+        ("block_slowness", 2, _FIELD.TYPE_DOUBLE, True, "Of each within the block, 1/frame"),
         ("alive", 3, _FIELD.TYPE_BOOL, False, "Whether the first varies as where it was learned"),
-        ("novelty", 4, _FIELD.TYPE_DOUBLE, False, "Of the block, 1 and above where it is another"),
+        (
+            "novelty",
+            4,
+            _FIELD.TYPE_DOUBLE,
+            False,
+            "Up to and with the block; above 1 it is not explained",
+        ),
         ("frame", 5, _FIELD.TYPE_SFIXED64, False, "Number of the frame"),
     ],
 )
@@ -49,15 +55,15 @@ class Applied:
     Attributes:
         block: the frames, no more than a block of the run that learned the modules.
         y: (n, R) outputs of all modules, side by side.
-        slowness: (R,) of each output within the block, 1/frame; infinite if it is constant.
+        block_slowness: (R,) of each output within the block, 1/frame; infinite if it is constant.
         alive: (M,) whether the module's first output varies as where it was learned.
-        novelty: (M,) difference from the stream that the module learned; it knows the block
-            below 1.
+        novelty: (M,) difference from the stream that the module learned; the module explains the
+            block up to 1. NaN for a block of one frame.
     """
 
     block: Block
     y: FloatArray
-    slowness: FloatArray
+    block_slowness: FloatArray
     alive: NDArray[np.bool_]
     novelty: FloatArray
 
@@ -128,7 +134,7 @@ def _table_sink(
 def _batch(
     waiting: Sequence[Applied], spec: SourceSpec, modules: Sequence[Module], log: str | None
 ) -> Any:
-    """Return outputs as rows of a table; a slowness or novelty that is not finite is null."""
+    """Return outputs as rows of a table; a slowness that is not finite is null."""
     import pyarrow as pa
 
     count = sum(len(module.phi) for module in modules)
@@ -140,10 +146,10 @@ def _batch(
 
     def repeated(name: str, width: int, dtype: type) -> NDArray[Any]:
         values: Any = np.array([getattr(applied, name) for applied in waiting], dtype)
-        rows = np.repeat(values.reshape(len(waiting), width), lengths, axis=0)
-        return np.where(np.isfinite(rows), rows, np.nan) if dtype is float else rows
+        return np.repeat(values.reshape(len(waiting), width), lengths, axis=0)
 
-    slowness = repeated("slowness", count, float)
+    slowness = repeated("block_slowness", count, float)
+    slowness[np.isinf(slowness)] = np.nan
     alive = repeated("alive", len(modules), bool)
     novelty = repeated("novelty", len(modules), float)
     streams = np.repeat(np.array([block.stream for block in blocks], int), lengths)
@@ -153,9 +159,9 @@ def _batch(
     table["stream"] = pa.array(np.array(spec.streams, object)[streams], pa.string())
     for i, (module, outputs) in enumerate(columns_of(modules)):
         name = f"module{module.index}"
-        for kind, values in (("y", y), ("slowness", slowness)):
+        for kind, values in (("y", y), ("block_slowness", slowness)):
             for j, column in enumerate(values[:, outputs].T):
-                table[f"{name}_{kind}{j}"] = pa.array(column, from_pandas=kind == "slowness")
+                table[f"{name}_{kind}{j}"] = pa.array(column, from_pandas=kind != "y")
         table[f"{name}_alive"] = pa.array(alive[:, i])
         table[f"{name}_novelty"] = pa.array(novelty[:, i], from_pandas=True)
     return pa.RecordBatch.from_pydict(table)
@@ -197,7 +203,7 @@ def _log_sink(
         for i, (_, outputs) in enumerate(columns_of(modules)):
             values = {
                 "y": applied.y[:, outputs],
-                "slowness": applied.slowness[outputs],
+                "block_slowness": applied.block_slowness[outputs],
                 "alive": applied.alive[i],
                 "novelty": applied.novelty[i],
                 "frame": block.t + np.arange(len(block)),
@@ -222,7 +228,7 @@ def _layout(outputs: int) -> Layout:
     return Layout(
         [
             ("y", float64, (outputs,), b"\x0a" + length),
-            ("slowness", float64, (outputs,), b"\x12" + length),
+            ("block_slowness", float64, (outputs,), b"\x12" + length),
             ("alive", np.dtype("u1"), (), b"\x18"),
             ("novelty", float64, (), b"\x21"),
             ("frame", np.dtype("<i8"), (), b"\x29"),
@@ -246,7 +252,7 @@ def json_line(applied: Applied, spec: SourceSpec, modules: Sequence[Module]) -> 
             {
                 "module": module.index,
                 "y": applied.y[:, outputs].tolist(),
-                "slowness": numbers(applied.slowness[outputs].tolist()),
+                "block_slowness": numbers(applied.block_slowness[outputs].tolist()),
                 "alive": bool(applied.alive[i]),
                 "novelty": numbers([float(applied.novelty[i])])[0],
             }

@@ -27,8 +27,8 @@ EVERY = 10
 class ViewSink:
     """Writes the images of each stream and the outputs of each module on them.
 
-    `/outputs/<stream>/<module>` holds the outputs frame by frame; `/slowness/<stream>` of the first
-    output of each module and `/novelty/<stream>` have a value a block, at its first frame.
+    `/outputs/<stream>/<module>` holds the outputs frame by frame; `/block_slowness/<stream>` of the
+    first output of each module and `/novelty/<stream>` have a value a block, at its first frame.
 
     Args:
         recording: where they go.
@@ -52,9 +52,9 @@ class ViewSink:
         at = frames[drawn], None
         self._writer.frames(view_entities(self._spec)[s], at, block.frames[drawn])
         first, names = (frames[:1], None), [f"module {m.index}" for m, _ in self._modules]
-        slowness = applied.slowness[[columns.start for _, columns in self._modules]]
+        slowness = applied.block_slowness[[columns.start for _, columns in self._modules]]
         slowness = np.where(np.isfinite(slowness), slowness, np.nan)
-        self._writer.lines(f"slowness/{stream}", names, first, slowness[None])
+        self._writer.lines(f"block_slowness/{stream}", names, first, slowness[None])
         self._writer.lines(f"novelty/{stream}", names, first, applied.novelty[None])
         for module, columns in self._modules:
             outputs = [f"y{j}" for j in range(1, len(module.phi) + 1)]
@@ -73,8 +73,12 @@ class ViewSink:
         entity, end = f"/{view_entities(self._spec)[s]}", self._end
         column = rrb.Vertical(
             images(entity, name) if self._spec.images else curve_view(name, [entity], end),
-            curve_view("Novelty of each block: explained below 1", [f"/novelty/{stream}"], end),
-            curve_view("Slowness of first outputs [cycles/frame]", [f"/slowness/{stream}"], end),
+            curve_view("Novelty of each block: explained up to 1", [f"/novelty/{stream}"], end),
+            curve_view(
+                "Slowness within each block, first outputs [cycles/frame]",
+                [f"/block_slowness/{stream}"],
+                end,
+            ),
         )
         outputs = [
             curve_view(f"Module {m.index}: y [SD]", [f"/outputs/{stream}/{m.index}"], recent=RECENT)

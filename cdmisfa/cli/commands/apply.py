@@ -233,9 +233,9 @@ def _print_rows(rows: Sequence[dict[str, Any]]) -> None:
         printing.line(f"{row['log']}: {counted(row['frames'], 'frame')} in all streams")
         cells = []
         for module in row["modules"]:
-            slowness = "-" if module["slowness"] is None else f"{module['slowness']:.4f}"
-            shares = f"{module['alive']:.0%}", f"{module['known']:.0%}"
-            cells.append((module["stream"], module["module"], slowness, *shares))
+            values = zip((".4f", ".0%", ".0%"), ("slowness", "alive", "explained"), strict=True)
+            texts = ["-" if module[k] is None else format(module[k], form) for form, k in values]
+            cells.append((module["stream"], module["module"], *texts))
         printing.table(("stream", "module", "slowness", "alive", "explained"), cells)
         if row["out"] is not None:
             printing.line(f"outputs written to {row['out']}")
