@@ -89,7 +89,7 @@ def test_a_folder_of_logs_becomes_one_table(
     assert Counter(rows) == {(name, "cam"): 90 for name in NAMES} | recorded
     done = cdmisfa("apply", run, logs, "-o", out)
     assert done.code == 3
-    assert "7 logs: 0 processed now, 7 processed before, 2 failed or incomplete" in done.out
+    assert "7 processed before; of all, 2 failed, 0 incomplete, 0 with warnings" in done.out
     assert "failed: broken.mcap: " in done.out
 
 
@@ -258,6 +258,32 @@ def test_a_log_damaged_half_way_is_named_each_time(
         shown = np.stack(list(pictures(row["frames"])))
         np.testing.assert_array_equal(y(table, "half.mcap"), Run(run).modules[0].transform(shown))
     assert cdmisfa("apply", run, log, "-o", tmp_path / "w.csv", "--skip-damaged").code == 0
+
+
+def test_views_of_one_recording_one_after_the_other_keep_their_outputs(
+    run: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    shown = np.stack(list(pictures(50)))
+    record(open_arrays({"cam": shown, "other": shown[::-1].copy()}), tmp_path / "rec")
+    for view in ("cam", "other"):
+        done = cdmisfa("apply", run, tmp_path / "rec" / f"{view}.mcap", "-o", tmp_path / "out")
+        assert done.code == 0, done.err
+    assert set(files(tmp_path / "out")) == {"cam.mcap.parquet", "other.mcap.parquet"}
+
+
+def test_the_summary_names_logs_that_were_cut_short(
+    run: Path, logs: Path, cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log = camera(logs / "cut.mcap", 3000)
+    log.write_bytes(log.read_bytes()[: log.stat().st_size * 2 // 3])
+    done = cdmisfa("apply", run, logs, "-o", tmp_path / "out")
+    assert (done.code, "0 failed, 0 incomplete, 1 with warnings" in done.out) == (0, True)
+    assert "cut.mcap: " in done.err
+    done = cdmisfa("apply", run, log)
+    assert done.code == 0
+    assert done.out.splitlines()[0].endswith(" frames in all streams, 1 warning")
+    (row,) = cdmisfa("apply", run, log, "--json").json["logs"]
+    assert "cut short" in row["warnings"][0]
 
 
 def test_workers_of_a_dask_cluster_apply_and_sweep(

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.blocks import FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name
 from cdmisfa.core.untrusted import read_json
@@ -190,13 +190,18 @@ def apply_to_log(
             contextlib.closing(application.to(source, frames)) as blocks,
         ):
             follow(blocks, [sink], totals)
-        warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
-        warnings += getattr(source, "skipped_damage", list)()
+        warnings = warnings_of(source)
     with writing(out):
         os.replace(part, out)
         to_disk(out.parent)
     damaged = None if totals.damaged is None else str(totals.damaged)
     return {"frames": totals.frames, "damaged": damaged, "warnings": warnings}
+
+
+def warnings_of(source: FrameSource) -> list[str]:
+    """Return the warnings about a source that was read: damage, and frames that were changed."""
+    warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
+    return warnings + getattr(source, "skipped_damage", list[str])()
 
 
 def written_to(
@@ -267,7 +272,10 @@ def _find_logs(
         for log in indexed_logs(path):
             name = log.name
             if "://" not in name:
-                name = os.path.normpath(path.parent / name)
+                # A single view has the name of its file: other views may follow into the folder.
+                name = os.path.normpath(
+                    path.parent / (log.files[0] if len(log.files) == 1 else name)
+                )
                 if name.startswith(os.path.join(out, "")):
                     continue
                 name = os.path.relpath(name, root) if name != root else os.path.basename(name)

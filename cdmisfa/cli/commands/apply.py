@@ -170,6 +170,7 @@ def _apply_to_each(
     Further arguments go to `Application.open`.
     """
     from cdmisfa.experiments.apply import Application
+    from cdmisfa.experiments.apply_logs import warnings_of
 
     application = Application(run)
     rows: list[dict[str, Any]] = []
@@ -183,8 +184,13 @@ def _apply_to_each(
             if totals.damaged is not None:
                 printing.status(f"{error}: the outputs before the damage are written")
                 code = totals.damaged.exit_code
-            row = {"log": " ".join(words), "out": output and str(output), "frames": totals.frames}
-            rows.append({**row, "error": error, "modules": totals.rows()})
+            row: dict[str, Any] = {
+                "log": " ".join(words),
+                "out": output and str(output),
+                "frames": totals.frames,
+            }
+            row |= {"error": error, "warnings": warnings_of(source), "modules": totals.rows()}
+            rows.append(row)
             if stop():
                 break
     if as_json and not as_lines:
@@ -230,7 +236,8 @@ def _print_rows(rows: Sequence[dict[str, Any]]) -> None:
     for row in rows:
         if not row["modules"]:
             continue
-        printing.line(f"{row['log']}: {counted(row['frames'], 'frame')} in all streams")
+        warned = f", {counted(len(row['warnings']), 'warning')}" if row["warnings"] else ""
+        printing.line(f"{row['log']}: {counted(row['frames'], 'frame')} in all streams{warned}")
         cells = []
         for module in row["modules"]:
             values = zip((".4f", ".0%", ".0%"), ("slowness", "alive", "explained"), strict=True)
@@ -251,9 +258,12 @@ def _print_applied_logs(run: Path, applied: AppliedLogs, as_json: bool) -> None:
         counts = {"computed": applied.computed, "skipped": applied.skipped}
         printing.document(run=run, out=applied.out, **counts, logs=rows)
         return
+    incomplete = sum(row["out"] is not None for row in applied.failed)
+    warned = sum(bool(row["warnings"]) for row in applied.logs)
     printing.line(
         f"{counted(len(applied.logs), 'log')}: {applied.computed} processed now, "
-        f"{applied.skipped} processed before, {len(applied.failed)} failed or incomplete"
+        f"{applied.skipped} processed before; of all, {len(applied.failed) - incomplete} failed, "
+        f"{incomplete} incomplete, {warned} with warnings"
     )
     for row in applied.failed[:MOST_LINES]:
         printing.line(f"failed: {row['log']}: {row['error']}")
