@@ -82,6 +82,21 @@ def test_frames_held_out_are_not_learned_from_and_judged_as_batch_sfa_is(
     assert lines[at + 1] == f"module 1 of log: {own}; batch SFA: {theirs}"
 
 
+def test_a_module_explains_its_training_log_and_no_log_of_other_speed(
+    cdmisfa: Cdmisfa, log: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    assert cdmisfa("learn", log, *LEARN, "-o", run, "--no-rerun").code == 0
+    shuffled = np.random.default_rng(0).permutation(values())
+    for path, low, high in (
+        (log, 0.95, 1.0),
+        (table(tmp_path / "fast.csv", shuffled), 0.0, 0.0),
+        (table(tmp_path / "large.csv", 5 * values()), 0.0, 0.0),
+    ):
+        (applied,) = cdmisfa("apply", run, path, *LEARN[:2], "--json").json["logs"]
+        assert low <= applied["modules"][0]["explained"] <= high
+
+
 @pytest.mark.parametrize(
     ("options", "held"),
     [

@@ -20,9 +20,14 @@ from cdmisfa.agents.progress.candidate import WHITE_NOISE_SLOWNESS, Candidate, l
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.decisions import (
     is_promising,
+    monitor_output,
+    new_streams,
+    novelty,
+    output_changed,
     rejection_reason,
     relative_fitted_slowness,
     relative_slowness,
+    start_monitoring,
 )
 from cdmisfa.agents.progress.learner import ProgressLearner
 from cdmisfa.core.blocks import Block, freeze
@@ -33,6 +38,26 @@ from recorder.recording import record
 from replay.open_sources import open_recording
 
 CONFIG = ProgressConfig(components=8)
+
+
+@pytest.mark.parametrize(
+    ("power", "steps", "slowness", "expected"),
+    [(1, 1, 1, 0), (10, 1, 1, 1), (0.1, 1, 1, 1), (1, np.exp(1.6), 1, 1), (1, 1, np.exp(-0.8), 1)],
+)
+def test_the_novelty_is_1_at_each_limit(
+    power: float, steps: float, slowness: float, expected: float
+) -> None:
+    assert novelty(power, steps, slowness) == pytest.approx(expected)
+
+
+@given(st.floats(-3, 3), st.floats(-3, 3))
+def test_a_stream_has_changed_where_the_novelty_is_above_1(size: float, speed: float) -> None:
+    row, y = new_streams(1)[0], 10**size * np.sin(np.arange(40) * 10**speed)
+    start_monitoring(row, 1.0, 0.01)
+    for _ in range(5):
+        monitor_output(row, y, 20)
+    ratio = np.mean(np.diff(y) ** 2) / (2 * np.pi * 0.01) ** 2
+    assert output_changed(row, 20) == (novelty(float(np.mean(y * y)), float(ratio)) > 1)
 
 
 def learned_from(source: MovingPictures, seed: int = 0, **settings: Any) -> ProgressLearner:
