@@ -11,6 +11,7 @@ from camera_files import HEIGHT, WIDTH, encoded, pictures, write_cameras
 from folders import external
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from recorder.mcap.reader import LogReader
 from recorder.recording import record
@@ -71,6 +72,27 @@ def test_others_readers_see_every_message(recording: Path, reader: str) -> None:
     with LogReader(recording) as ours:
         assert theirs == [(m.channel.topic, m.log_time, m.data) for m in ours.messages()]
     np.testing.assert_array_equal([pixels(data) for _, _, data in theirs], EXPECTED)
+
+
+@pytest.mark.parametrize("topics", [None, ["/b"]])
+@pytest.mark.parametrize("size", [0, 40, 9000])
+def test_payloads_of_any_size_are_those_that_mcap_reads(
+    tmp_path: Path, size: int, topics: list[str] | None
+) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=50_000)
+        writer.start()
+        channels = [writer.register_channel(topic, "raw", 0) for topic in ("/a", "/b")]
+        for i in range(60):
+            data = bytes([i]) * (size + i)
+            writer.add_message(channels[i % 3 == 1], i, data, i + 1, sequence=i + 2)
+        writer.finish()
+    with (tmp_path / "a.mcap").open("rb") as file, LogReader(tmp_path / "a.mcap") as reader:
+        theirs = make_reader(file).iter_messages(topics)
+        assert [
+            (m.channel.id, m.sequence, m.log_time, m.publish_time, m.data)
+            for m in reader.messages(topics)
+        ] == [(m.channel_id, m.sequence, m.log_time, m.publish_time, m.data) for _, _, m in theirs]
 
 
 def test_rerun_shows_images_as_images(recording: Path) -> None:

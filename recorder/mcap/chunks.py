@@ -39,6 +39,8 @@ from recorder.mcap.store import Store
 
 # Message indexes of a chunk: channel, and (n, 2) log time (ns) and offset of each message.
 Pairs = list[tuple[int, NDArray[np.uint64]]]
+# Mean bytes of a chunk for each message below which the chunk is copied to slice its payloads.
+_SMALL: Final = 2048
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +85,17 @@ class MessageTable:
         return MessageTable(self.data, pick(rows))
 
     def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
-        """Yield each message: channel, sequence, log time, publish time and payload."""
-        data = self.data.data
-        for log_time, published, at, size, sequence, channel, _ in self.records.tolist():
-            yield channel, sequence, log_time, published, bytes(data[at : at + size])
+        """Return an iterator over channel, sequence, log time, publish time and payload."""
+        # Lists of columns are faster than a list of rows; and slices of bytes than those of a view,
+        # which for small messages saves more than the copy of the chunk takes.
+        names = "channel", "sequence", "log_time", "publish_time"
+        columns = [self.records[name].tolist() for name in names]
+        spans = map(slice, self.at.tolist(), (self.at + self.size).tolist())
+        if len(self.data) < _SMALL * len(self):
+            payloads = map(self.data.tobytes().__getitem__, spans)
+        else:
+            payloads = map(bytes, map(self.data.data.__getitem__, spans))
+        return zip(*columns, payloads, strict=True)
 
     def payload(self, row: int) -> bytes:
         """Return a copy of a message's payload."""
