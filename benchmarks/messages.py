@@ -24,7 +24,7 @@ class Topic(NamedTuple):
 
     name: str
     period: int
-    count: int
+    number: int
     payloads: Sequence[bytes]
 
 
@@ -47,7 +47,7 @@ def write(path: Path, compression: str, topics: Sequence[Topic]) -> int:
         writer.start(profile="ros2")
         for topic in topics:
             channel = writer.register_channel(topic.name, "cdr", 0)
-            for i in range(topic.count):
+            for i in range(topic.number):
                 data = topic.payloads[i % len(topic.payloads)]
                 events.append((i * topic.period, channel, data))
                 total += len(data)
@@ -88,7 +88,7 @@ READERS: Mapping[str, Callable[[Path, str | None], int]] = {
     "small-mcap without CRC": partial(small, crc=False),
 }
 NOTE = (
-    "Every message of a log in the order of its log times: topic, time, and payload. Readers check "
+    "Topic, time and payload of every message, stored in the order of log time. Readers check "
     "the CRC of each chunk, except in the last column: without a check, small-mcap needs no pass "
     "over the bytes, and hands out parts of the chunk, where cdmisfa returns a copy. CPU time of "
     "all threads; the factors say how many times as fast cdmisfa is."
@@ -115,7 +115,7 @@ def main(*, quick: bool = False) -> None:
         for name, (topics, selected) in cases.items():
             for compression in ("none", "lz4", "zstd"):
                 size = write(
-                    path, compression, [t._replace(count=t.count // share) for t in topics]
+                    path, compression, [t._replace(number=t.number // share) for t in topics]
                 )
                 work = {reader: partial(f, path, selected) for reader, f in READERS.items()}
                 times = interleaved(work, rounds, time.process_time_ns)

@@ -157,9 +157,9 @@ PARTS = {
     ),
     "messages": Part(
         "Reading messages",
-        "Every message of an MCAP log in the order of its log times, with topic, time and payload, "
-        "and how many times as fast cdmisfa is as other readers. All check the CRC of each chunk, "
-        "except in the last column.",
+        "Topic, time and payload of every message of an MCAP log, which stores them in the order "
+        "of log time; and how many times as fast cdmisfa is as other readers. All check the CRC of "
+        "each chunk, except in the last column.",
         (0, 1, 2, 3, 4, 5),
     ),
     "foreign": Part(
