@@ -26,12 +26,16 @@ PIECE: Final = 64
 # Logs with up to this many bytes are hashed when they are opened; larger ones after the run.
 AT_ONCE: Final = 64 * 1024 * 1024
 
+# Length in frames of the gap between two episodes, whose times a dataset does not state, and
+# between two passes over a log.
+PAUSE: Final = 20
+
 # Called with the number of hashed bytes and the total.
 HashProgress = Callable[[int, int], None]
 
 
 class StoredSource(ClockedSource):
-    """A source of stored frames: all of them once, or looped, lap after lap.
+    """A source of stored frames: all of them once, several times, or looped without end.
 
     A derived class sets `_spec`, `_loop`, `frames`, `gaps` and, with gaps, `_ranges`.
 
@@ -40,6 +44,7 @@ class StoredSource(ClockedSource):
         first_frame: number of the first frame.
         centre: "episode": frames are shown without the mean of their episode; see `episode`.
         held_out: frames at the end that `take` does not return; see `hold_out`.
+        passes: number of times that `take` returns the frames; see `repeat`.
         more: a remedy, beside looping, for too few frames.
         to_judge: whether the last frames are held out by default; see `hold_out`.
         recorded: whether it is a recording of ours.
@@ -52,6 +57,7 @@ class StoredSource(ClockedSource):
     first_frame: int = 0
     centre: Centre = "run"
     held_out: int = 0
+    passes: int = 1
     more: str = ""
     to_judge: bool = False
     recorded: bool = False
@@ -66,8 +72,37 @@ class StoredSource(ClockedSource):
 
     @property
     def end(self) -> int:
-        """The frame after the last that `take` returns, of the first lap."""
+        """The frame after the last that `take` returns, of the first pass."""
         return self.first_frame + self.frames - self.held_out
+
+    @property
+    def lap(self) -> int:
+        """Number of frames from the beginning of a pass to that of the next.
+
+        Between two passes is a gap, except in a loop.
+        """
+        return self.frames + (PAUSE if self.passes > 1 else 0)
+
+    @property
+    def passes_begun(self) -> int:
+        """Number of passes over the frames that have begun."""
+        return max(self._t - self.first_frame - 1, 0) // self.lap + 1
+
+    @property
+    def last(self) -> int:
+        """The frame after the last that `take` returns, of all passes."""
+        return self.end + (self.passes - 1) * self.lap
+
+    def repeat(self, passes: int) -> None:
+        """Return the frames this number of times; call it after `hold_out`.
+
+        Raises:
+            UsageError: the source loops.
+        """
+        if self._loop and passes > 1:
+            raise UsageError(f"{self._name()}: it is repeated without end, and not {passes} times")
+        self.passes = passes
+        self._spec = replace(self._spec, length=self.last - self.first_frame)
 
     def hold_out(self, count: int) -> None:
         """Keep the last frames from `take`: modules are judged on them, see `pieces`.
@@ -117,25 +152,38 @@ class StoredSource(ClockedSource):
         """
         check_request(self._spec, 0, n)
         stop = self._t + n
-        if not self._loop and stop > self.end:
+        if not self._loop and stop > self.last:
             raise self._exhausted(n)
         blocks = tuple(
             self._centred(stream, low, high - low)
             for stream in range(len(self._spec.streams))
-            for low, high in self.spans(stream, self._t, stop)
+            for low, high in self._in_passes(stream, self._t, stop, self.frames - self.held_out)
         )
         self._t = stop
         return blocks
 
     def spans(self, stream: int, start: int, stop: int) -> list[Span]:
         """Return the unbroken stretches [low, high) of a stream within the frames [start, stop)."""
-        return [*self._spans(stream, start, stop)]
+        return [*self._in_passes(stream, start, stop, self.frames)]
+
+    def _in_passes(self, stream: int, start: int, stop: int, frames: int) -> Iterator[Span]:
+        """Yield the unbroken stretches in the first `frames` frames of each pass; see `spans`."""
+        if self.passes == 1:
+            yield from self._spans(stream, start, stop)
+            return
+        for number in range((start - self.first_frame) // self.lap, self.passes):
+            begin = self.first_frame + number * self.lap
+            low, high = max(start, begin), min(stop, begin + frames)
+            if low < high:
+                yield from self._spans(stream, low, high)
+            if stop <= begin:
+                return
 
     def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
-        """See `spans`."""
+        """See `spans`; both ends are in the same pass, unless the source loops."""
         if not self.gaps:
             return [(start, stop)]
-        first, count = self.first_frame, self.frames
+        first, count = self.first_frame, self.lap
         laps = range((start - first) // count, (stop - 1 - first) // count + 1)
         shifted = ((lap * count, span) for lap in laps for span in self._ranges[stream])
         return merged((max(low + by, start), min(high + by, stop)) for by, (low, high) in shifted)
@@ -151,7 +199,7 @@ class StoredSource(ClockedSource):
         """
         if not self.gaps:
             return self.first_frame, self.first_frame + self.frames
-        ranges, t = self._ranges[stream], self.first_frame + (t - self.first_frame) % self.frames
+        ranges, t = self._ranges[stream], self.first_frame + (t - self.first_frame) % self.lap
         return ranges[bisect.bisect_right(ranges, t, key=lambda span: span[0]) - 1]
 
     def seek(self, t: int) -> None:
@@ -163,9 +211,9 @@ class StoredSource(ClockedSource):
         """
         if t < self.first_frame:
             raise ValueError(f"frame {t} lies before the first, {self.first_frame}")
-        if not self._loop and t > self.end:
+        if not self._loop and t > self.last:
             raise LogExhaustedError(
-                f"{self._name()}: it ends at frame {self.end}, before frame {t}; repeat it "
+                f"{self._name()}: it ends at frame {self.last}, before frame {t}; repeat it "
                 "with --loop"
             )
         self._t = t
@@ -220,7 +268,9 @@ class StoredSource(ClockedSource):
         return self._identities
 
     def _with_centre(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-        described = self.described(logs)
+        described = dict(self.described(logs))
+        if self.passes > 1:
+            described["passes"] = self.passes
         return described if self.centre == "run" else {**described, "centre": self.centre}
 
     @abstractmethod
@@ -246,7 +296,7 @@ class StoredSource(ClockedSource):
             return block
         parts, at = [], 0
         while at < n:  # an episode ends where a lap does
-            place = (t + at - self.first_frame) % self.frames
+            place = (t + at - self.first_frame) % self.lap
             count = min(n - at, self.frames - place)
             mean = self._mean(stream, self.first_frame + place)
             parts.append(centred(block.frames[at : at + count], mean))
@@ -271,13 +321,15 @@ class StoredSource(ClockedSource):
     def _unbroken(self, stream: int, n: int) -> int:
         """Return the first of the next n frames of a stream that follow one another."""
         # Looping, a stretch that holds them is in the rest of this lap or in the next two.
-        end = self._t + 3 * self.frames + n if self._loop else self.end
-        for low, high in self._spans(stream, self._t, end):
+        end = self._t + 3 * self.frames + n if self._loop else self.last
+        for low, high in self._in_passes(stream, self._t, end, self.frames - self.held_out):
             if high - low >= n:
                 return low
         raise self._exhausted(n)
 
     def _exhausted(self, n: int) -> LogExhaustedError:
+        if self.passes > 1 and self.passes_begun > 1:
+            return LogExhaustedError(f"{self._name()} was read {self.passes} times")
         left = max(self.end - self._t, 0)
         unbroken = " without a gap" if self.gaps else ""
         reserved = f", before {self.held_out} held-out frames" if self.held_out else ""

@@ -70,8 +70,8 @@ def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_pa
     times = [(START_MS + (at + i) * STEP_MS, x) for at, own in each for i, x in enumerate(own)]
     one = write_images(tmp_path / "one.mcap", {"/cam": times})
     run = tmp_path / "run"
-    learned = cdmisfa("learn", folder, *QUICK, "--json", "-o", run)
-    alike = cdmisfa("learn", one, *QUICK, "--json")
+    learned = cdmisfa("learn", folder, *QUICK, "--json", "--passes", 1, "-o", run)
+    alike = cdmisfa("learn", one, *QUICK, "--json", "--passes", 1)
     assert (learned.code, learned.json["iterations"]) == (0, 16)
     assert learned.json["signals_sha256"] == alike.json["signals_sha256"]
     assert "4 episodes, ordered by start time, then by path: ep0.mcap to ep3.mcap" in learned.err
@@ -80,11 +80,13 @@ def test_episodes_are_learned_as_one_log_with_pauses_is(cdmisfa: Cdmisfa, tmp_pa
         (f"ep{i}.mcap", [at, at + 45]) for i, at in enumerate(first)
     ]
     assert cdmisfa("check", run).code == 0
-    named = cdmisfa("learn", "--episodes", *sorted(folder.glob("*.mcap"))[::-1], *QUICK, "--json")
+    named = cdmisfa(
+        "learn", "--episodes", *sorted(folder.glob("*.mcap"))[::-1], *QUICK, "--json", "--passes", 1
+    )
     assert named.json["signals_sha256"] == learned.json["signals_sha256"]
-    by_index = cdmisfa("learn", folder / "corpus.parquet", *QUICK, "--json")
+    by_index = cdmisfa("learn", folder / "corpus.parquet", *QUICK, "--json", "--passes", 1)
     assert by_index.json["signals_sha256"] == learned.json["signals_sha256"]
-    result = package.learn(str(folder), tau=10)
+    result = package.learn(str(folder), tau=10, passes=1)
     assert result.result["signals_sha256"] == learned.json["signals_sha256"]
     (folder / "ep2.mcap").unlink()
     without = cdmisfa("check", run, "--json")
@@ -165,12 +167,12 @@ def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
     damaged = folder / "ep1.mcap"
     flip(damaged, damaged.stat().st_size // 2)
     run = tmp_path / "run"
-    done = cdmisfa("learn", folder, *QUICK, "--json", "-o", run)
+    done = cdmisfa("learn", folder, *QUICK, "--json", "--passes", 1, "-o", run)
     assert done.code == 3, done.err
     assert "the rest of this log is skipped" in done.err
     assert 18 <= done.json["iterations"] < 24
     assert cdmisfa("check", run).code == 0
-    centre = ("--set", "input.centre=episode", "--json")
+    centre = ("--set", "input.centre=episode", "--json", "--passes", 1)
     without = cdmisfa("learn", folder, *QUICK, *centre)
     assert (without.code, without.json["iterations"]) == (3, 18)  # its mean is not known
     assert "this log is skipped" in without.err
@@ -190,7 +192,7 @@ def test_stopped_in_the_middle_of_many_episodes_it_is_resumed_with_the_same_sign
         np.save(folder / f"ep{i}.npy", x.T)
     assert cdmisfa("index", folder).code == 0
     words = (folder, *QUICK, "--set", "learner.watch=9999", "--set", "input.centre=episode")
-    words = (*words, "--set", "input.holdout=0", "--json")
+    words = (*words, "--set", "input.holdout=0", "--passes", 1, "--json")
     whole = cdmisfa("learn", *words).json
     assert whole["iterations"] == 300
     assert cdmisfa("learn", *words, "-o", run, "--max-iterations", 151).code == 0

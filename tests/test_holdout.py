@@ -124,7 +124,7 @@ def test_going_on_keeps_to_what_the_run_learns_from(
     cdmisfa: Cdmisfa, log: Path, tmp_path: Path
 ) -> None:
     once, resumed, fork = (tmp_path / name for name in ("once", "resumed", "fork"))
-    how = (*LEARN[:-1], "--no-rerun")
+    how = (*LEARN[:-1], "--no-rerun", "--passes", "1")
     whole = cdmisfa("learn", log, *how, "-o", once, "--json").json
     cdmisfa("learn", log, *how, "-o", resumed, "--max-iterations", "20")
     assert (

@@ -261,7 +261,13 @@ source = option(
     multiple=True,
 )
 
-loop = option("--loop", "Start a recording or log again when it ends.")
+loop = option("--loop", "Start a recording or log again when it ends, without limit.")
+passes = option(
+    "--passes N",
+    "Read a log at most this number of times, until each stream is decided. [default: 20; learners "
+    "2.0 and 1.0 and recordings of a scene: 1]",
+    type=Number(1),
+)
 skip_damaged = option(
     "--skip-damaged",
     "Skip damage inside a log, and damaged images, instead of stopping with an error.",

@@ -154,7 +154,8 @@ def result(run: RunResult, *, as_json: bool) -> None:
         line(f"not decided: {', '.join(run.undecided)}")
     if run.held_out:
         holdout_slowness(run.held_out)
-    line(f"ended after {counted(run.iterations, 'iteration')}: {END_REASONS[run.ended]}")
+    passes = f" and {run.passes} passes over the log" if (run.passes or 1) > 1 else ""
+    line(f"ended after {counted(run.iterations, 'iteration')}{passes}: {END_REASONS[run.ended]}")
     line(f"signals sha256 {run.signals_sha256}")
     if run.run is not None:
         line(f"run written to {run.run}; view it with cdmisfa view {quoted(run.run)}")

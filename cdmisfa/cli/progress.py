@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.printing import Stderr, status
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from cdmisfa.cli.interrupts import Stop
-    from cdmisfa.core.blocks import Block, SourceSpec
+    from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
 
@@ -115,11 +115,19 @@ class RunProgress(Sink):
         spec: specification of the source.
         max_iterations: limit of the run, if it has one.
         events: also print events, such as a saved module.
+        source: the source, whose passes are shown.
     """
 
     def __init__(
-        self, display: Bar, spec: SourceSpec, max_iterations: int | None, *, events: bool = True
+        self,
+        display: Bar,
+        spec: SourceSpec,
+        max_iterations: int | None,
+        *,
+        events: bool = True,
+        source: Any = None,
     ) -> None:
+        self._source = source
         self._bar, self._spec, self._events = display, spec, events
         self._max_iterations = max_iterations
         self._next_update = 0.0
@@ -156,7 +164,9 @@ class RunProgress(Sink):
         left = f"ε {signals.epsilon:.2f}"
         if learning:
             left = f"{learning} of {len(streams)} streams not decided"
-        return f"attending to {streams[signals.stream]}, {saved}, {left}"
+        most = getattr(self._source, "passes", 1)
+        at = f"pass {self._source.passes_begun} of at most {most}, " if most > 1 else ""
+        return f"{at}attending to {streams[signals.stream]}, {saved}, {left}"
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Print a warning."""
@@ -176,7 +186,7 @@ class RunProgress(Sink):
 
 
 @contextlib.contextmanager
-def learning(spec: SourceSpec, max_iterations: int | None) -> Iterator[tuple[Stop, RunProgress]]:
+def learning(source: FrameSource, max_iterations: int | None) -> Iterator[tuple[Stop, RunProgress]]:
     """Show the progress of a run while the body runs; the first signal asks it to stop."""
     with bar("learning", "blocks") as progress_bar, stoppable() as stop:
-        yield stop, RunProgress(progress_bar, spec, max_iterations)
+        yield stop, RunProgress(progress_bar, source.spec, max_iterations, source=source)

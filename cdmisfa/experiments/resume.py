@@ -209,9 +209,11 @@ class Recomputation:
                 f"the source has other streams than {self.log} was learned from: name the run's "
                 "own source with --source"
             )
-        held_out = self.header.manifest["source"].get("held_out", 0)
-        if held_out and isinstance(source, StoredSource):
-            source.hold_out(held_out)
+        stated = self.header.manifest["source"]
+        if isinstance(source, StoredSource):
+            if stated.get("held_out"):
+                source.hold_out(stated["held_out"])
+            source.passes = stated.get("passes", 1)
         self._source = source
         source.seek(self.t)
         return source

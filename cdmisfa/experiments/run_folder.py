@@ -54,6 +54,7 @@ OPENING = ("loop", "skip_damaged", "episodes")
 OPTIONS = (
     *("seed", "preset", "settings", "algorithm"),
     *OPENING,
+    "passes",
     *INPUTS,
     *("max_iterations", "max_modules"),
 )
@@ -180,6 +181,7 @@ class RunResult:
         held_out: slowness of the modules on frames that were held out, see `evaluate`.
         ended: reason for the end, a key of `END_REASONS`.
         undecided: streams that were still being learned at the end.
+        passes: number of passes over a log that have begun; None for other sources.
     """
 
     run: str | None
@@ -193,6 +195,7 @@ class RunResult:
     held_out: Mapping[str, Any]
     ended: str
     undecided: tuple[str, ...]
+    passes: int | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return the result as `learn --json` prints it."""
@@ -201,6 +204,8 @@ class RunResult:
         values |= values.pop("summary")
         if not self.held_out:
             del values["held_out"]
+        if self.passes is None:
+            del values["passes"]
         return {"schema": 1, **values, "undecided": list(self.undecided)}
 
 

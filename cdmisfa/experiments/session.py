@@ -317,6 +317,7 @@ class Session:
             held_out=held_out,
             ended=ended,
             undecided=undecided,
+            passes=getattr(self.source, "passes_begun", None),
         )
 
     def _copy_log(self, log: RunWriter, before: Path, digest: Digest) -> None:

@@ -20,6 +20,7 @@ from cdmisfa.agents.learners import LEARNERS, learner_class
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
+from cdmisfa.experiments.holdout import repeat
 from cdmisfa.experiments.run_folder import module_table, with_recipes
 from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import (
@@ -38,7 +39,7 @@ from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.folders import REQUEST
 
 # Keys of a run's result that a trial's row stores elsewhere or not at all.
-DROPPED_KEYS = ("schema", "run", "source", "seed", "signals_sha256", "undecided")
+DROPPED_KEYS = ("schema", "run", "source", "seed", "signals_sha256", "undecided", "passes")
 
 
 def sweep(
@@ -88,6 +89,7 @@ def plan(
     preset: str | None = None,
     settings: Sequence[str] = (),
     loop: bool = False,
+    passes: int | None = None,
     inputs: InputOptions | None = None,
     **limits: int | None,
 ) -> list[PlannedTrial]:
@@ -100,6 +102,7 @@ def plan(
         preset: preset to use instead of that of the source.
         settings: `section.key=value` words for all trials.
         loop: True to start a log again at its end.
+        passes: see `repeat`.
         inputs: how images of logs become frames; see `open_source`.
         limits: `max_iterations` and `max_modules`, at which each trial ends.
 
@@ -118,7 +121,7 @@ def plan(
             recorded, spec = dict(logs.describe()), logs.spec
     inputs = inputs or InputOptions()
     opening = {"loop": loop, "inputs": inputs}
-    seeds, ends = tuple(seeds), [limits.get("max_iterations"), limits.get("max_modules")]
+    seeds, ends = tuple(seeds), [*map(limits.get, ("max_iterations", "max_modules")), passes]
     trials: dict[str, PlannedTrial] = {}
     for values in itertools.product(*grid.values()):
         point = dict(zip(grid, values, strict=True))
@@ -136,7 +139,8 @@ def plan(
                 depends.append(configuration.tables())
             if inputs != InputOptions():
                 depends.append(dataclasses.asdict(inputs))
-            call = partial(compute_trial, paths, configuration, opening, seed=seed, **limits)
+            ends_at = {**limits, "passes": passes}
+            call = partial(compute_trial, paths, configuration, opening, seed=seed, **ends_at)
             trial = make_trial(call, depends, seed, recorded, ends, point=point, seed=seed)
             trials.setdefault(trial.id, trial)
     return list(trials.values())
@@ -156,6 +160,7 @@ def compute_trial(
     opening: Mapping[str, Any],
     *,
     seed: int,
+    passes: int | None = None,
     **limits: Any,
 ) -> dict[str, Any]:
     """Run one trial: on oscillatory streams entirely in C if possible, else like `learn`.
@@ -165,6 +170,7 @@ def compute_trial(
         configuration: the configuration with the point of the grid and the seed.
         opening: `loop` and `inputs` of `open_logs`.
         seed: seed of the trial.
+        passes: see `repeat`.
         limits: `max_iterations` and `max_modules`.
 
     Returns:
@@ -185,6 +191,7 @@ def compute_trial(
                 "epsilon": result.epsilon,
                 "ended": result.ended,
             }
+        repeat(opened, configuration, passes)
         options: dict[str, Any] = {"seed": seed, "sections": configuration.tables()}
         learned = run_session(opened, configuration.learner, rerun=False, **options, **limits)
     return {key: value for key, value in learned.as_json().items() if key not in DROPPED_KEYS}

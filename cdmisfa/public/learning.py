@@ -12,7 +12,7 @@ from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.learning import Sink
-from cdmisfa.experiments.holdout import hold_out
+from cdmisfa.experiments.holdout import hold_out, repeat
 from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import (
@@ -40,6 +40,7 @@ def learn(
     preset: str | None = None,
     holdout: float | None = None,
     loop: bool = False,
+    passes: int | None = None,
     episodes: bool = False,
     centre: Centre = "run",
     force: bool = False,
@@ -71,7 +72,9 @@ def learn(
         preset: name of a preset, or a .toml file.
         holdout: share of a log, at its end, on which the progress learner is evaluated and does
             not learn; None: 0.1.
-        loop: True to start logs or arrays again at their end.
+        loop: True to start logs or arrays again at their end, without limit.
+        passes: largest number of times that logs or arrays are read, until each stream is decided;
+            None: 20 for the progress learner, except on recordings of a scene; else 1.
         episodes: see `Recording`.
         centre: "episode" to learn from frames without the mean of their episode.
         force: True to replace an existing run.
@@ -91,11 +94,13 @@ def learn(
     words += InputOptions(holdout=holdout, centre=centre).settings()
     how: dict[str, Any] = {"preset": preset, "settings": words, "seed": int(seed)}
     limits = {"max_iterations": max_iterations, "max_modules": max_modules}
+    ends = {**limits, "passes": passes}
     logs: dict[str, Any] = {"loop": loop, "episodes": episodes}
     with _opened(source, logs, how) as (frames, configuration, command), _folder(out) as folder:
         hold_out(frames, configuration)
+        repeat(frames, configuration, passes)
         if command is not None:
-            command = command_of(command[0], {**how, **limits, **command[1]}, folder)
+            command = command_of(command[0], {**how, **ends, **command[1]}, folder)
         run_session(
             frames,
             configuration.learner,

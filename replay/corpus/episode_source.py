@@ -21,11 +21,10 @@ from replay.corpus.episode import (
     relative_names,
     sampled,
 )
-from replay.logs.formats.lerobot import PAUSE
 from replay.logs.source import LoggedSource
 from replay.open_sources import open_log
 from replay.storage.identity import Identity
-from replay.stored_source import Span, StoredSource
+from replay.stored_source import PAUSE, Span, StoredSource
 
 # Largest number of warnings of one kind that are printed; the others are only counted, so that a
 # folder with many damaged logs does not flood the terminal.
@@ -170,7 +169,7 @@ class EpisodeSource(StoredSource):
 
     def episode(self, stream: int, t: int) -> Span:
         """Return the frames [start, stop) of the log, or dataset episode, that contains frame t."""
-        t %= self.frames
+        t %= self.lap
         episode = self._episodes[bisect.bisect_right(self._starts, t) - 1]
         if episode.many:
             spans = episode.spans(self._spec.streams[stream])
@@ -214,15 +213,15 @@ class EpisodeSource(StoredSource):
 
     def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
         name = self._spec.streams[stream]
-        lap, at = divmod(start, self.frames)
+        lap, at = divmod(start, self.lap)
         number = max(bisect.bisect_right(self._starts, at) - 1, 0)
         while True:
             for i in range(number, len(self._episodes)):
                 episode = self._episodes[i]
-                if lap * self.frames + episode.start >= stop:
+                if lap * self.lap + episode.start >= stop:
                     return
                 for low, high in episode.spans(name):
-                    low, high = low + lap * self.frames, high + lap * self.frames
+                    low, high = low + lap * self.lap, high + lap * self.lap
                     if max(low, start) < min(high, stop):
                         yield max(low, start), min(high, stop)
             if not self._loop:
@@ -230,7 +229,7 @@ class EpisodeSource(StoredSource):
             lap, number = lap + 1, 0
 
     def _block(self, stream: int, t: int, n: int) -> Block:
-        place = t % self.frames
+        place = t % self.lap
         number = bisect.bisect_right(self._starts, place) - 1
         self._reading = number, place
         episode, source = self._episodes[number], self._log(number)

@@ -152,7 +152,7 @@ class LoggedSource(StoredSource):
         rows, parts = self._clock.rows[stream], []
         at = t
         while at < t + n:
-            place = (at - self.first_frame) % self.frames
+            place = (at - self.first_frame) % self.lap
             stop = min(place + t + n - at, self.frames)
             parts.append(self._frames(stream, at, rows[place:stop]))
             at += stop - place
@@ -188,8 +188,9 @@ class LoggedSource(StoredSource):
             if after == len(self.streams):
                 after, start = 0, t + len(rows)
         stop = start + max(len(rows), LIKELY)
-        ahead = np.arange(start, stop if self._loop else min(stop, self.end))
-        next_rows = np.asarray(self._clock.rows[after])[(ahead - self.first_frame) % self.frames]
+        ahead = np.arange(start, stop if self._loop else min(stop, self.last))
+        ahead = (ahead - self.first_frame) % self.lap
+        next_rows = np.asarray(self._clock.rows[after])[ahead[ahead < self.frames]]
         places = [(stream, int(row)) for row in rows]
         places += [(after, row) for row in next_rows.tolist()]
         last = {(number, row) for number, (row, _) in self._last_frames.items()}

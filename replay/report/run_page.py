@@ -79,6 +79,8 @@ def _lead(run: RunData) -> str:
         f"{learned} of {len(run.spec.streams)} streams learned, {run.outline.iterations:,} "
         f"iterations, {run.outline.frames:,} frames"
     )
+    if isinstance(passes := run.result.get("passes"), int) and passes > 1:
+        lead += f", {passes} passes over the log"
     fork = run.header.manifest.get("fork")
     if isinstance(fork, Mapping):
         lead += f". Fork of {fork.get('parent')} after {fork.get('at')} iterations"

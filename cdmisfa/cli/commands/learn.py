@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 @options.max_iterations
 @options.max_modules
 @options.loop
+@options.passes
 @options.option("--resume")
 @options.skip_damaged
 @options.option("--live-view")
@@ -54,6 +55,7 @@ def learn_command(
     algorithm: str | None,
     max_iterations: int | None,
     max_modules: int | None,
+    passes: int | None,
     resume: bool,
     live_view: bool,
     no_rerun: bool,
@@ -111,9 +113,10 @@ def learn_command(
         settings = (*settings, f"learner.algorithm={algorithm}")
     live = any(map(is_live, source))
     arguments |= {"inputs": inputs, "settings": settings, "seed": seed, "resumed": resume}
+    arguments["passes"] = passes
     with (
         _opened_source(source, output, record_to, force, **arguments) as (frames, configuration),
-        learning(frames.spec, max_iterations) as (stop, progress),
+        learning(frames, max_iterations) as (stop, progress),
     ):
         color = getattr(frames, "color", inputs.color)  # what --color auto chose
         session = Session(
@@ -158,7 +161,7 @@ def _opened_source(
     words: Sequence[str], output: Path | None, record_to: Path | None, force: bool, **arguments: Any
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Open a source, with the arguments of `open_source`; print its notes and warnings."""
-    from cdmisfa.experiments.holdout import hold_out
+    from cdmisfa.experiments.holdout import hold_out, repeat
     from cdmisfa.experiments.run_folder import OPENING
     from cdmisfa.experiments.sources import is_scene, open_source
     from recorder.cameras.words import is_live
@@ -169,7 +172,8 @@ def _opened_source(
         raise UsageError(f"{words[0]} is a live stream: --resume needs a source that can go back")
     if record_to is not None and not live:
         raise UsageError(f"{words[0]} is no live stream: {are_for(['--record'], 'live streams')}")
-    unused = [f"--{name.replace('_', '-')}" for name in OPENING if arguments[name]]
+    unused = [f"--{n.replace('_', '-')}" for n in (*OPENING, "passes") if arguments[n]]
+    passes = arguments.pop("passes")
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
     for folder in filter(None, (output, record_to) if live else ()):
@@ -182,6 +186,7 @@ def _opened_source(
         stack.enter_context(contextlib.closing(frames))
         if not live:
             hold_out(frames, configuration)
+            repeat(frames, configuration, passes)
             printing.source(frames)
         stack.callback(printing.source_changes, frames)
         if record_to is not None:
@@ -281,7 +286,7 @@ def fork_command(
     limits = {name: limit for name, limit in given.items() if limit is not None}
     with (
         Session.fork(run, iteration, output, limits=limits, **arguments) as session,
-        learning(session.source.spec, max_iterations) as (stop, progress),
+        learning(session.source, max_iterations) as (stop, progress),
     ):
         result = _run_learner(session, stop, progress, rerun=not no_rerun)
     both = f"{printing.quoted(run)} {printing.quoted(output)}"

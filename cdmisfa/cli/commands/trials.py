@@ -32,6 +32,7 @@ MOST_SEEDS = 1_000_000
 @options.max_iterations
 @options.max_modules
 @options.loop
+@options.passes
 @options.inputs(*options.ALL_INPUTS)
 @options.jobs
 @options.scheduler

@@ -24,11 +24,9 @@ from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic
 from replay.logs.formats.table import number_stream
 from replay.logs.formats.video import VideoFile
 from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, explained, limited
+from replay.stored_source import PAUSE
 
 INFO: Final = "meta/info.json"
-
-# Length of the gap between two episodes, in frames: the dataset does not state their times.
-PAUSE: Final = 20
 
 _IMAGES: Final = ("video", "image")
 
