@@ -82,7 +82,10 @@ def test_signals_of_a_run_are_tables_of_each_library(run: Run) -> None:
     assert 0 < missing.sum() < len(missing)
     names = ("iteration", "stream", "novel", "reward", "eta")
     pandas, polars = signals.to_pandas(*names), signals.to_polars(*names)
-    assert pandas.index.name == "iteration"
+    for chosen in ((), ("reward",), names):
+        pandas = signals.to_pandas(*chosen)
+        assert list(pandas.columns) == signals.to_arrow(*chosen).column_names
+        assert list(pandas.index) == list(range(len(missing)))
     assert str(pandas["novel"].dtype) == str(pandas["reward"].dtype).replace("float64", "bool")
     np.testing.assert_array_equal(pandas["reward"], signals["reward"])
     assert polars["reward"].null_count() == missing.sum()

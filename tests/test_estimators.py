@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -11,12 +14,16 @@ import pytest
 from numpy.typing import NDArray
 from river import checks
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.estimator_checks import check_estimator
 
+import cdmisfa
+from cdmisfa.core.errors import UsageError
 from cdmisfa.estimators import IncSFA, OnlineSFA, RecursiveSFA
 from cdmisfa.features.sfa import batch_sfa, slowness
 
 Make = Callable[[], Any]
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 BOTH = pytest.mark.parametrize("make", [RecursiveSFA, IncSFA])
 
 
@@ -111,6 +118,29 @@ def test_incsfa_follows_what_is_slow() -> None:
     np.testing.assert_allclose(sfa.slowness_, slowness(y), rtol=0.1)
 
 
+def test_incsfa_warns_if_and_only_if_its_output_is_not_the_slowest_feature() -> None:
+    found, t = [], np.arange(20_000.0)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        slow = rng.standard_normal((len(t), 12))
+        slow[:, 0] = np.sqrt(2) * np.sin(t / 200)
+        rotated, mixing = np.linalg.qr(rng.standard_normal((12, 12)))[0], rng.standard_normal
+        for X in (slow @ rotated, slow @ mixing((12, 12)), slow[:, 1:], waves(20_000, 3 + seed)):
+            with warnings.catch_warnings(record=True) as warned:
+                warnings.simplefilter("always", ConvergenceWarning)
+                y = IncSFA().fit(X).transform(X)[:, 0]
+            best = (X - X.mean(axis=0)) @ batch_sfa(X, 1)[0]
+            found.append(correlation(y, best) >= 0.9 and slowness(y[:, None])[0] < 0.2)
+            assert found[-1] != bool(warned), (seed, X.shape)
+    assert 6 <= sum(found) <= 12
+    with pytest.warns(ConvergenceWarning, match="slowest feature .* use RecursiveSFA"):
+        IncSFA().fit(slow[:, 1:])
+    for one in (slow[:, :1], slow[:, :2] * [1, 0], np.ones((9, 2))):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            IncSFA().fit(one)
+
+
 @BOTH
 @pytest.mark.parametrize(
     ("parameters", "X", "message"),
@@ -145,7 +175,47 @@ def test_a_sample_at_a_time_gives_the_same_bits() -> None:
     assert online.slowness == sfa.slowness_[0]
 
 
-@pytest.mark.parametrize("lost", [None, float("nan"), float("inf"), 1e200, "word"])
+@pytest.mark.parametrize(
+    "kind", [Decimal, Fraction, str, np.array, np.float32, lambda v: np.array(v, "f4")]
+)
+def test_samples_hold_any_type_of_number(kind: Callable[[float], Any]) -> None:
+    online, plain = OnlineSFA(), OnlineSFA()
+    for x in samples(np.round(waves(300), 2).astype(np.float32).astype(float)):
+        online.learn_one({name: kind(value) for name, value in x.items()})
+        plain.learn_one(x)
+    assert online.slowness == plain.slowness > 0
+
+
+@pytest.mark.parametrize("wrong", ["word", [1.0], 1j, 10**400, np.ma.masked])
+def test_a_value_that_is_no_number_is_refused_by_its_name(wrong: Any) -> None:
+    online = OnlineSFA()
+    with pytest.raises(UsageError, match=r"^b(: some values are masked| is .*: give a number)"):
+        online.learn_one({"a": 1.0, "b": wrong})
+
+
+def test_masked_values_are_refused_everywhere_with_one_message() -> None:
+    X = waves(400)
+    module = cdmisfa.learn(waves(20_000)).modules[0]
+    uses: list[Callable[[Any], Any]] = [
+        RecursiveSFA().fit,
+        IncSFA().partial_fit,
+        RecursiveSFA().fit(X).transform,
+        module.transform,
+        cdmisfa.Recording,
+        lambda x: cdmisfa.learn(x, max_iterations=2),
+        lambda x: cdmisfa.learn({"a": X, "X": x}, max_iterations=2),
+        lambda x: cdmisfa.learn(iter(x), max_iterations=2),
+    ]
+    masks = [np.arange(X.size).reshape(X.shape) == 7, np.ones_like(X, bool)]
+    for use in uses:
+        use(np.ma.array(X, mask=False))
+        for mask in masks:
+            for masked in (np.ma.array(X, mask=mask), list(np.ma.array(X, mask=mask))):
+                with pytest.raises(ValueError, match="some values are masked: fill them"):
+                    use(masked)
+
+
+@pytest.mark.parametrize("lost", [None, float("nan"), float("inf"), 1e200])
 def test_a_sample_that_lacks_something_is_a_gap(lost: Any) -> None:
     X, online, sfa = waves(300), OnlineSFA(), RecursiveSFA()
     incomplete = samples(X)[0] | {"a": lost} if lost else {"b": 1.0}

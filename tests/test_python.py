@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import os
+import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +173,85 @@ def test_a_run_gives_what_its_log_holds(tmp_path: Path) -> None:
             again.frames(*part)
     again.view(tmp_path / "view.rrd")
     assert (tmp_path / "view.rrd").stat().st_size > 0
+
+
+def test_parts_of_a_temporary_run_outlive_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    kept = learn(numbers(), tmp_path / "kept", **FEW)
+    for use in (
+        lambda run: run.signals.to_arrow().equals(kept.signals.to_arrow()),
+        lambda run: len(list(run.signals.values())),
+        lambda run: iter(run.signals.items()),
+        lambda run: run.signals["y"],
+        lambda run: run.modules,
+        lambda run: run.events,
+        lambda run: run.frames,
+        lambda run: run.frames(0, 2).shape == kept.frames(0, 2).shape,
+        lambda run: run.at(3).iteration == 3,
+        lambda run: run.report,
+    ):
+        part = use(learn(numbers(), **FEW))
+        gc.collect()
+        assert part() is not None if callable(part) else part is not False
+        if hasattr(part, "__next__"):
+            assert len(list(part)) == len(kept.signals)
+    signals = learn(numbers(), **FEW).signals
+    gc.collect()
+    assert signals.to_arrow().equals(kept.signals.to_arrow())
+    del signals, part
+    gc.collect()
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+
+
+class Press(cdmisfa.Sink):
+    """Presses Ctrl-C at an iteration."""
+
+    def __init__(self, at: int = 3, times: int = 1) -> None:
+        self.at, self.times = at, times
+
+    def block(self, block: Any, signals: Any, learner: Any) -> None:
+        if signals.iteration == self.at:
+            for _ in range(self.times):
+                os.kill(os.getpid(), signal.SIGINT)
+                signal.sigpending()  # Python runs the handler between two bytecodes
+
+
+def test_ctrl_c_saves_the_run_and_raises(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", numbers(2000))
+    source, folder = str(tmp_path / "x.npy"), tmp_path / "run"
+    whole = learn(source, tmp_path / "whole", max_iterations=20, tau=20)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match=r"the run is saved: .*run"):
+        learn(source, folder, max_iterations=20, tau=20, sinks=[Press()])
+    assert signal.getsignal(signal.SIGINT) is before
+    run = Run(folder)
+    assert run.signals["iteration"].tolist() == [0, 1, 2, 3]
+    assert run.events[-1].text.startswith("ended: it was interrupted")
+    assert cdmisfa("learn", "--resume", "-o", folder).code == 0
+    assert (
+        dict(Run(folder).result or {})["signals_sha256"]
+        == dict(whole.result or {})["signals_sha256"]
+    )
+    with pytest.raises(KeyboardInterrupt, match="twice is not finished: continue with --resume"):
+        learn(source, tmp_path / "twice", max_iterations=20, tau=20, sinks=[Press(times=2)])
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_is_the_callers_if_it_has_a_handler_or_learns_in_a_thread() -> None:
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        assert len(learn(numbers(), **FEW, sinks=[Press()]).signals["iteration"]) == 12
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert pressed == [signal.SIGINT]
+    runs: list[Run] = []
+    thread = threading.Thread(target=lambda: runs.append(learn(numbers(), **FEW)))
+    thread.start()
+    thread.join()
+    assert len(runs[0].signals["iteration"]) == 12
 
 
 def test_a_recording_gives_the_frames_of_its_streams() -> None:

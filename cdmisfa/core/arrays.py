@@ -23,6 +23,16 @@ _TYPES = (np.dtype(np.float64), np.dtype(np.uint8))
 GRAY = 128
 
 
+class MaskedError(UsageError, ValueError):
+    """Masked array; NumPy functions would use the values below its mask."""
+
+
+def refuse_masked(data: Any, name: str = "frames") -> None:
+    """Raise a `MaskedError` if values of an array, or of a list of arrays, are masked."""
+    if any(map(np.ma.is_masked, data if isinstance(data, list | tuple) else [data])):
+        raise MaskedError(f"{name}: some values are masked: fill them, or leave out the rows")
+
+
 def as_array(data: Any, name: str = "frames") -> NDArray[Any]:
     """Return a user's frames as an array; the columns of a table become the values of a frame.
 
@@ -33,16 +43,16 @@ def as_array(data: Any, name: str = "frames") -> NDArray[Any]:
     Raises:
         UsageError: rows differ in length, values are masked, or a column is not numeric.
     """
+    values = without_table(data, name)
     try:
-        return np.asarray(without_table(data, name))
+        return np.asarray(values)
     except ValueError as error:
         raise UsageError(f"{name} differ in length: give an array of equal frames") from error
 
 
 def without_table(data: Any, name: str = "frames") -> Any:
     """Return `data`, or the values of a table with NaN for missing ones; see `as_array`."""
-    if np.ma.is_masked(data):
-        raise UsageError(f"{name}: some values are masked: fill them, or leave out the rows")
+    refuse_masked(data, name)
     if hasattr(data, "to_frame"):  # one column of pandas or Polars
         data = data.to_frame()
     tabular = hasattr(data, "iloc") or hasattr(data, "__arrow_c_stream__")

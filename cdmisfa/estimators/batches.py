@@ -6,6 +6,7 @@ follow the previous one; no difference is then taken across the gap.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from numbers import Integral, Real
 from typing import Any, Self
@@ -13,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from cdmisfa.agents.inputs import LARGEST_VALUE
-from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.arrays import FloatArray, refuse_masked
 from cdmisfa.core.config import MAX_COMPONENTS, LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.features.incsfa import IncrementalFeature
@@ -23,6 +24,7 @@ from cdmisfa.kernels import mean_output, multiply
 
 try:
     from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.utils.validation import check_is_fitted, check_random_state, validate_data
 except ImportError:
 
@@ -45,6 +47,11 @@ else:
 # Samples that are converted to float64 at once. It is a multiple of the pieces in which
 # `RecursiveFeature` learns, so that its value does not change the result.
 CHUNK = 16 * PIECE
+
+# IncSFA has converged if its first output has at least this correlation with the slowest feature of
+# the last `REFERENCE` samples, and at most this share of the slowness of the whitened input. White
+# noise of 5,000 samples and 12 features reaches a share of 0.97 by chance.
+CONVERGED, BELOW_INPUT, REFERENCE = 0.9, 0.95, 8000
 
 
 class _SlowFeatures(_Estimator):
@@ -96,7 +103,7 @@ class _SlowFeatures(_Estimator):
             ValueError: X is not valid.
         """
         check_is_fitted(self)
-        X = validate_data(self, X, reset=False, dtype="numeric")
+        X = self._checked(X, reset=False)
         weights, mean = np.ascontiguousarray(self.components_), self.mean_
         offset = mean_output(weights, mean)
         return np.concatenate([project(weights, offset, x) for x in _chunks(X)])
@@ -126,7 +133,7 @@ class _SlowFeatures(_Estimator):
 
     def _learn(self, X: Any, gap: bool, fewest: int) -> Self:
         first = not self.__sklearn_is_fitted__()
-        X = validate_data(self, X, reset=first, dtype="numeric", ensure_min_samples=fewest)
+        X = self._checked(X, reset=first, ensure_min_samples=fewest)
         largest = max(abs(float(X.max())), abs(float(X.min())))
         if largest > LARGEST_VALUE:
             raise ValueError(f"X holds {largest:g}, above the limit of {LARGEST_VALUE:g}: scale it")
@@ -140,6 +147,10 @@ class _SlowFeatures(_Estimator):
             self.n_samples_seen_ += len(x)
             gap = False
         return self
+
+    def _checked(self, X: Any, **options: Any) -> Any:
+        refuse_masked(X, "X")
+        return validate_data(self, X, dtype="numeric", **options)
 
     def _check(self, n_features: int) -> None:
         sizes = {"n_components": self.n_components, "n_whitened": self.n_whitened}
@@ -268,6 +279,39 @@ class IncSFA(_SlowFeatures):
     _moments: FloatArray
     _measured: int
     _last: FloatArray
+
+    def fit(self, X: Any, y: Any = None) -> Self:
+        """Learn from one sequence; forget everything learned before.
+
+        A `ConvergenceWarning` is raised if the first output is not the slowest feature of the last
+        samples (correlation below 0.9 with that of `RecursiveSFA`), or is not slower than the
+        whitened input, as in white noise.
+
+        Args:
+            X: (n, I) samples that follow one another in time.
+            y: ignored.
+
+        Raises:
+            ValueError: X or a parameter is not valid.
+        """
+        super().fit(X)
+        last = self._checked(X, reset=False)[-REFERENCE:]
+        slowest = RecursiveFeature(last.shape[1], self.n_whitened)
+        for x in _chunks(last):
+            slowest.update(x)
+        spectrum = slowest.state.spectrum[np.isfinite(slowest.state.spectrum)]
+        if len(spectrum) < 2:  # one feature cannot be slower than the input
+            return self
+        fit, whitened = slowest.compare(self.components_[0]), np.sqrt(np.mean(spectrum**2))
+        if fit.rho < CONVERGED or fit.slowness > BELOW_INPUT * whitened:
+            warnings.warn(
+                f"IncSFA has not converged: its first output has slowness {fit.slowness:.4f}, "
+                f"the whitened input {whitened:.4f}, and the slowest feature {spectrum[0]:.4f} "
+                f"(correlation {fit.rho:.2f}): use RecursiveSFA, or give more samples",
+                ConvergenceWarning,
+                stacklevel=2,
+            )
+        return self
 
     @property
     def slowness_(self) -> FloatArray:

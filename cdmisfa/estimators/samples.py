@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from cdmisfa.agents.inputs import LARGEST_VALUE
-from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.arrays import FloatArray, refuse_masked
 from cdmisfa.core.errors import UsageError
 from cdmisfa.features.outputs import project
 from cdmisfa.features.recursive import RecursiveFeature
@@ -29,9 +29,9 @@ except ImportError:
 class OnlineSFA(Transformer):  # type: ignore[misc]
     """Slow feature analysis of all samples so far, in river's interface; see `RecursiveSFA`.
 
-    The features of x are those of the first sample. A sample that lacks one of them, or holds a
-    value that is not finite, counts as a gap: nothing is learned from it. In `transform_one` the
-    mean replaces a missing value.
+    The first sample names the features of x. A later sample that lacks one of them, or holds None,
+    NaN, or a number above 1e100, counts as a gap: nothing is learned from it. In `transform_one`
+    the mean replaces a missing value.
 
     Args:
         n_components: number of slow features; those beyond the features of x are 0.
@@ -61,7 +61,7 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
         """Learn from a sample that follows the previous one.
 
         Raises:
-            UsageError: a parameter is not valid.
+            UsageError: a parameter is not valid, or a value is neither a number nor None.
         """
         if self._feature is None and x:
             self._names = tuple(sorted(x, key=str))
@@ -90,10 +90,13 @@ class OnlineSFA(Transformer):  # type: ignore[misc]
 
     def _sample(self, x: Mapping[Any, Any]) -> FloatArray:
         """Return the features in their order, NaN for a value that is missing or not finite."""
-        values = (x.get(name, nan) for name in self._names)
-        return np.array([float(v) if _is_number(v) else nan for v in values])
+        return np.array([_number(name, x.get(name)) for name in self._names])
 
 
-def _is_number(value: Any) -> bool:
-    real = isinstance(value, int | float | np.number | np.bool_)
-    return real and bool(abs(value) <= LARGEST_VALUE)  # a NaN is not
+def _number(name: Any, value: Any) -> float:
+    refuse_masked(value, str(name))
+    try:
+        number = nan if value is None else float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise UsageError(f"{name} is {value!r}: give a number, or None if it is missing") from None
+    return number if abs(number) <= LARGEST_VALUE else nan  # a NaN is not

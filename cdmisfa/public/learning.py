@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
+import signal
 import tempfile
+import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, description
@@ -87,6 +91,7 @@ def learn(
         UsageError: the source, a setting or the folder is wrong.
         LogDamagedError: a log is damaged.
         LogExhaustedError: the source is shorter than one block.
+        KeyboardInterrupt: Ctrl-C was pressed; the run up to there is saved in `out`.
     """
     words = [f"learner.{name}={value}" for name, value in settings.items()]
     if algorithm is not None:
@@ -96,11 +101,17 @@ def learn(
     limits = {"max_iterations": max_iterations, "max_modules": max_modules}
     ends = {**limits, "passes": passes}
     logs: dict[str, Any] = {"loop": loop, "episodes": episodes}
-    with _opened(source, logs, how) as (frames, configuration, command), _folder(out) as folder:
+    with (
+        _opened(source, logs, how) as (frames, configuration, command),
+        _folder(out) as folder,
+        _interruptible(folder, stop) as stop,
+    ):
         hold_out(frames, configuration)
         repeat(frames, configuration, passes)
         if command is not None:
             command = command_of(command[0], {**how, **ends, **command[1]}, folder)
+        if hasattr(frames, "stop"):
+            frames.stop = stop  # so that Ctrl-C also ends waiting for frames
         run_session(
             frames,
             configuration.learner,
@@ -118,7 +129,8 @@ def learn(
         if command is None and isinstance(frames, LoggedSource) and frames.in_memory:
             run._source = Recording.of(source)  # the folder has only hashes of arrays
         if out is None:
-            weakref.finalize(run, shutil.rmtree, folder.parent, ignore_errors=True)
+            # The run refers to its signals, which read the folder and can outlive it.
+            weakref.finalize(run.signals, shutil.rmtree, folder.parent, ignore_errors=True)
     return run
 
 
@@ -134,6 +146,36 @@ def _folder(out: str | Path | None) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+@contextlib.contextmanager
+def _interruptible(folder: Path, stop: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C end the run after its iteration, and then raise KeyboardInterrupt.
+
+    A second Ctrl-C interrupts at once. A handler of the caller keeps its place.
+
+    Yields:
+        `stop` of the run, which is also true after Ctrl-C.
+    """
+    pressed: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+        os.write(2, b"finishing; press Ctrl-C again to stop at once\n")
+
+    plain = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ours = plain and threading.current_thread() is threading.main_thread()
+    if ours:
+        signal.signal(signal.SIGINT, handle)
+    try:
+        yield lambda: bool(pressed) or stop()
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+    if pressed:
+        raise KeyboardInterrupt(f"the run is saved: {folder}")
 
 
 @contextlib.contextmanager

@@ -76,9 +76,8 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
         return signals_table(self._log, names or SCALARS)
 
     def to_pandas(self, *names: str) -> Any:
-        """Return the table as a pandas DataFrame, indexed by the column `iteration`."""
-        table = self.to_arrow(*names).to_pandas()
-        return table.set_index("iteration") if "iteration" in table else table
+        """Return the table of `to_arrow` as a pandas DataFrame."""
+        return self.to_arrow(*names).to_pandas()
 
     def to_polars(self, *names: str) -> Any:
         """Return the table as a Polars DataFrame."""
@@ -188,7 +187,8 @@ class Run(Described, replay.runs.run.StoredRun):
         """Write the results as one HTML page that needs no network and no other file.
 
         Args:
-            out: the file (.html); None: report.html in the run's folder, replaced.
+            out: the file (.html); None: report.html in the run's folder, replaced; it is removed
+                with a temporary run.
 
         Raises:
             UsageError: the file exists.
