@@ -150,9 +150,9 @@ TABLE: dict[str, dict[str, tuple[str, str, str]]] = {
         "none": ("0 0 0 0 - 0", "whole", ""),
         "empty": ("3 3 3 3 - 3", "damaged", "PyArrow cannot read it"),
         "another format": ("3 3 3 3 - 3", "damaged", "PyArrow cannot read it"),
-        "cut in the middle": ("3 3 3 3 - 3", "damaged", "PyArrow cannot read it"),
+        "cut in the middle": ("3 3 3 3 - 3", "damaged", "has 1 cell, but the first line has"),
         "cut at the end": ("0 0 0 0 - 0", "whole", ""),
-        "bit flip": ("0 0 3 3 - 3", "whole", "PyArrow cannot read it"),
+        "bit flip": ("0 3 3 3 - 3", "damaged", "which is not a number"),
     },
     "Parquet": {
         "none": ("0 0 0 0 - 0", "whole", ""),

@@ -90,6 +90,10 @@ def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Pat
         result = [block.frames for block in source.take_all(101 + PAUSE)]
     for block, numbers in zip(result, expected, strict=True):
         np.testing.assert_array_equal(block, numbers.astype(np.float32))
+    with external(out) as source:  # without cameras: all numbers but those that count frames
+        assert [*source.streams[0].fields] == ["observation.environment_state", *fields]
+        every = source.take(0, len(result[0])).frames
+        np.testing.assert_array_equal(every[:, -result[0].shape[1] :], result[0])
     with pytest.raises(UsageError, match="no field state; choose from observation"):
         external(out, fields=["state"])
     table = out / "data/chunk-000/file-000.parquet"

@@ -233,7 +233,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
         ({}, "set --rate in frames per second, or name the column of times.* --set input.time"),
         ({"fields": ["z"], "rate": 5}, "no column z; it has s, a, word"),
         ({"fields": ["word"], "rate": 5}, "t.csv: --field word: it is not a number but a text"),
-        ({"time": "word"}, r"word \(string\) has no times after 1970"),
+        ({"time": "word"}, r"word \(string\) has no times from 1970 to 2116"),
         ({"time": "s:h"}, r"no column s:h; .* a unit \(s, ms, us, ns\)"),
         ({"time": "big"}, r"big \(int64\) has no times .* or in s: state the unit"),
         ({"time": "us"}, r"state the unit \(s, ms, us, ns\), as in --set input.time=us:ns"),

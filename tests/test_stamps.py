@@ -66,6 +66,14 @@ def test_images_are_shown_at_the_times_of_their_headers(kind: str, tmp_path: Pat
         assert source.describe()["stamp"] == "header"
 
 
+def test_a_time_in_a_header_beyond_any_clock_is_refused(tmp_path: Path) -> None:
+    kind = MessageKind("Joints", "json")
+    messages = [json.dumps({"x": i, "stamp": {"sec": 2**70, "nsec": i}}).encode() for i in range(9)]
+    path = write_mcap(tmp_path / "a.mcap", kind, {"/joints": every(STEP, messages)})
+    with pytest.raises(LogDamagedError, match=r"/joints .*: the time in its header is too large"):
+        external(path, fields=["x"], stamp="header")
+
+
 @pytest.mark.parametrize("ros1", [True, False])
 def test_ros_says_it_in_the_header_that_a_message_begins_with(ros1: bool) -> None:
     pytest.importorskip("rosbags")

@@ -120,9 +120,10 @@ def source(frames: FrameSource) -> None:
 
 def source_changes(frames: FrameSource) -> None:
     """Print damage that showed while a log was read, or the counts of live streams."""
+    from cdmisfa.experiments.documents import warnings_of
+
     if not hasattr(frames, "stop"):
-        changes = getattr(frames, "changes", {}).values()
-        for text in (*changes, *getattr(frames, "skipped_damage", list)()):
+        for text in warnings_of(frames)[len(getattr(frames, "warnings", ())) :]:
             warning(text)
         return
     unit = "images" if frames.spec.images else "messages"
@@ -137,14 +138,14 @@ def source_changes(frames: FrameSource) -> None:
 # Results of runs
 
 
-def result(run: RunResult, *, as_json: bool) -> None:
-    """Print the result of a run that has ended."""
+def result(run: RunResult, warnings: Sequence[str] | None) -> None:
+    """Print the result of a run that has ended: as JSON with the source's warnings, if given."""
     from cdmisfa.core.names import counted
     from cdmisfa.core.outcomes import END_REASONS
     from replay.integrity.report import ModuleInfo
 
-    if as_json:
-        json_document(run.as_json())
+    if warnings is not None:
+        json_document({**run.as_json(), "warnings": warnings})
         return
     streams = run.summary.get("streams")
     modules([ModuleInfo.of(m) for m in run.modules], policies=streams is None)

@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.blocks import FrameSource, SourceSpec
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.apply import Application, Totals, follow
-from cdmisfa.experiments.documents import plain, write_json, writing
+from cdmisfa.experiments.documents import plain, warnings_of, write_json, writing
 from cdmisfa.experiments.store import (
     FAILED,
     ROWS,
@@ -196,12 +196,6 @@ def apply_to_log(
         to_disk(out.parent)
     damaged = None if totals.damaged is None else str(totals.damaged)
     return {"frames": totals.frames, "damaged": damaged, "warnings": warnings}
-
-
-def warnings_of(source: FrameSource) -> list[str]:
-    """Return the warnings about a source that was read: damage, and frames that were changed."""
-    warnings = [*getattr(source, "warnings", ()), *getattr(source, "changes", {}).values()]
-    return warnings + getattr(source, "skipped_damage", list[str])()
 
 
 def written_to(

@@ -36,6 +36,13 @@ def plain(value: Any) -> Any:
             return value
 
 
+def warnings_of(source: object) -> list[str]:
+    """Return the warnings about a source, including changed and damaged frames."""
+    changes = getattr(source, "changes", {}).values()
+    damage: list[str] = getattr(source, "skipped_damage", list)()
+    return [*getattr(source, "warnings", ()), *changes, *damage]
+
+
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a Markdown table, without a line end after the last line."""
     lines = (head, ["---"] * len(head), *rows)

@@ -18,6 +18,7 @@ from recorder.images.options import InputOptions
 from replay.logs import clock as clocks
 from replay.logs.clock import FrameClock
 from replay.logs.formats.arrays import FPS
+from replay.logs.formats.table import TIME_NAMES
 from replay.logs.stream import LogStream, joined
 
 
@@ -73,7 +74,14 @@ def _rate(streams: Sequence[LogStream]) -> float:
     timed = next((stream for stream in streams if stream.times is not None), streams[0])
     step = float("nan") if timed.times is None else clocks.step_of(timed.times)
     if not (step > 0 and (timed.read is None or 1 / step <= RECORDED_FPS[1])):
-        column = next((n for n in timed.fields if n in ("time", "timestamp", "stamp")), "COLUMN")
+        if timed.times is not None and not step > 0:
+            why = (
+                "has one row" if timed.count == 1 else "has most rows at the time of the row before"
+            )
+            raise UsageError(
+                f"{timed.path} {why}, so it has no frame rate: set --rate in frames per second"
+            )
+        column = next((n for n in timed.fields if n in TIME_NAMES), "COLUMN")
         name = f", or name the column of times and its unit with --set input.time={column}:s"
         hint = name if timed.read is not None else ""
         raise UsageError(f"{timed.path} has no frame rate: set --rate in frames per second{hint}")

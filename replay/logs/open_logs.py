@@ -188,7 +188,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
 
     Args:
         path: the log.
-        whole: read all messages of a bag, not only its index.
+        whole: read all messages of a bag, not only its index, and all cells of a table.
 
     Raises:
         LogDamagedError: the log cannot be read.
@@ -200,7 +200,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
     if kind == "bag":
         return bag.bag_channels(path, whole=whole)
     if kind == "table":
-        return table.table_channels(path)
+        return table.table_channels(path, whole=whole)
     if kind == "arrays":
         return arrays.array_channels(path)
     with open_stream(path) as stream:

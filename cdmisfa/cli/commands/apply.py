@@ -170,7 +170,7 @@ def _apply_to_each(
     Further arguments go to `Application.open`.
     """
     from cdmisfa.experiments.apply import Application
-    from cdmisfa.experiments.apply_logs import warnings_of
+    from cdmisfa.experiments.documents import warnings_of
 
     application = Application(run)
     rows: list[dict[str, Any]] = []

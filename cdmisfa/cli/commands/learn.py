@@ -101,6 +101,7 @@ def learn_command(
         cdmisfa learn camera:/dev/video0 --record recordings/desk -o runs/desk
         cdmisfa learn recordings/kitchen --loop --max-modules 2 -o runs/kitchen
     """
+    from cdmisfa.experiments.documents import warnings_of
     from cdmisfa.experiments.run_folder import command_of
     from cdmisfa.experiments.session import Session
     from recorder.cameras.words import is_live
@@ -133,7 +134,8 @@ def learn_command(
             hashing=progress.hashing,
         )
         result = _run_learner(session, stop, progress, rerun=not no_rerun, live_view=live_view)
-    code = _print_run(result, stop, can_resume=not live, as_json=as_json)
+    warnings = warnings_of(frames) if as_json else None
+    code = _print_run(result, stop, can_resume=not live, warnings=warnings)
     return code or (LogDamagedError.exit_code if getattr(frames, "left_out", ()) else 0)
 
 
@@ -213,12 +215,21 @@ def _run_learner(
     return session.learn(sinks=(progress,), stop=stop, rerun=rerun, live=viewer)
 
 
-def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool) -> int:
-    """Print the result of a run, write its report unless interrupted; return the exit code."""
+def _print_run(
+    result: RunResult, stop: Stop, *, can_resume: bool, warnings: Sequence[str] | None
+) -> int:
+    """Print the result of a run, write its report unless interrupted; return the exit code.
+
+    Args:
+        result: the result.
+        stop: the signals so far.
+        can_resume: whether an interrupted run can be continued.
+        warnings: warnings about the source, for a JSON document; None for text.
+    """
     from cdmisfa.core.outcomes import INTERRUPTED
     from cdmisfa.experiments.reports import write_report
 
-    printing.result(result, as_json=as_json)
+    printing.result(result, warnings)
     folder = printing.quoted(result.run or "")
     if result.ended == INTERRUPTED:
         if folder and can_resume:
@@ -233,7 +244,7 @@ def _print_run(result: RunResult, stop: Stop, *, can_resume: bool, as_json: bool
             f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
         )
         return 0
-    if not as_json:
+    if warnings is None:
         printing.line(f"report written to {page}")
     return 0
 
@@ -291,4 +302,4 @@ def fork_command(
         result = _run_learner(session, stop, progress, rerun=not no_rerun)
     both = f"{printing.quoted(run)} {printing.quoted(output)}"
     printing.status(f"compare both with cdmisfa compare {both} --save both.rrd")
-    return _print_run(result, stop, can_resume=True, as_json=as_json)
+    return _print_run(result, stop, can_resume=True, warnings=[] if as_json else None)

@@ -30,6 +30,9 @@ INFO: Final = "meta/info.json"
 
 _IMAGES: Final = ("video", "image")
 
+# Features that number the frames.
+_CLOCK: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+
 
 class Dataset:
     """The frames of a dataset: where each episode begins, and when each frame is.
@@ -63,13 +66,18 @@ def streams(
 ) -> list[LogStream]:
     """Open the cameras of a dataset, or the numbers that are asked for as one stream.
 
+    A dataset without cameras is read as all its numbers, without the numbers of frames.
+
     Raises:
         UsageError: no such camera or numbers, another version of the layout, or PyAV is missing.
         LogDamagedError: its tables cannot be read, or contradict each other.
     """
+    numeric, cameras = features(path)
+    if not cameras and not options.fields:
+        fields = tuple(name for name in numeric if name not in _CLOCK)
+        options = replace(options, fields=fields)
     if options.fields:
         return [_numbers(path, options)]
-    cameras = features(path)[1]
     chosen = [c for c in cameras if not options.topics or fits_topic(c, options.topics)]
     if not chosen or (not options.topics and len(chosen) > 1):
         wrong = f"no topic {', '.join(options.topics)}" if options.topics else "choose a --topic"

@@ -166,6 +166,11 @@ def by_stamps(stream: LogStream) -> LogStream:
             stamps[row] = stream.taken(row, stamp)
         except (MalformedRecord, MalformedImage) as error:
             raise LogDamagedError(f"{stream.name_of(row)}: {error}") from None
+        except OverflowError:
+            raise LogDamagedError(
+                f"{stream.name_of(row)}: the time in its header is too large: remove "
+                "--set input.stamp=header"
+            ) from None
     if stream.stamp is None or (len(stamps) > 1 and stamps.min() == stamps.max()):
         raise UsageError(
             f"{stream.path}: the headers on {stream.topic} have no times: remove "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import check_regular
 from recorder.images.fields import EXACT, Field, bounded, is_path
 from recorder.images.options import NUMBERS_RECIPE, InputOptions
@@ -32,6 +34,9 @@ MAX_ROWS: Final = 4 * 1024**2
 # Words for a missing value that PyArrow does not know by itself.
 _MISSING: Final = (" ", "-", "--", "?", "<NA>", "None", "none", "na", "n.a.", "N.A.", "Null")
 
+# Names of columns that are probably times.
+TIME_NAMES: Final = ("time", "timestamp", "stamp", "log_time")
+
 _NUMBER: Final = r"^[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \t]*$"
 
 
@@ -40,10 +45,11 @@ def streams(
 ) -> list[LogStream]:
     """Read the numbers of a table as one stream, in the order of time.
 
-    The columns are `options.fields`, or by default all numeric ones except the times; a column of
-    lists or of structures is a message, with the fields that `Field` names. Times are in the
-    column `options.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`.
-    Without it the rows are at an even rate.
+    The columns are `options.fields`, or by default all numeric ones except the times: numbers,
+    decimals, truth as 0 and 1, durations in seconds. Warnings name all others. A column of lists
+    or of structures is a message, with the fields that `Field` names. Times are in the column
+    `options.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`. Without it
+    the rows are at an even rate.
 
     Rows without a number or a time are left out, and those with one that is not finite where
     numbers are kept in no range.
@@ -70,7 +76,40 @@ def streams(
     def where(row: int) -> str:  # by its line of CSV, from 1, or its row of Parquet, from 0
         return f"{path}: line {row + 2}" if csv else f"{path}: row {row}"
 
-    return [number_stream(path, path.stem, numbers, times, options, where)]
+    stream = number_stream(path, path.stem, numbers, times, options, where)
+    lines = [*([] if options.fields else _left_out(table, [*fields, time_column]))]
+    lines += _converted(table, fields)
+    if not time_column and (likely := [name for name in fields if name in TIME_NAMES]):
+        lines.append(
+            f"{likely[0]} is read as a number, not as the time of a row: for times, set "
+            f"--set input.time={likely[0]}"
+        )
+    return [replace(stream, warnings=[*(f"{path}: {n}" for n in lines), *stream.warnings])]
+
+
+def _left_out(table: Any, fields: Sequence[str]) -> list[str]:
+    """Return a line that names the columns of a table that are not read, if there are any."""
+    absent = [
+        f"{name} ({'empty' if column.null_count == len(column) else column.type})"
+        for name, column in zip(table.column_names, table.columns, strict=True)
+        if name not in fields
+    ]
+    return [f"columns without plain numbers are left out: {', '.join(absent)}"] if absent else []
+
+
+def _converted(table: Any, fields: Sequence[str]) -> list[str]:
+    """Return a line for durations and one for decimals among the columns that are read."""
+    import pyarrow.types as kinds
+
+    lines = []
+    for is_kind, what in (
+        (kinds.is_duration, "durations are read in seconds"),
+        (kinds.is_decimal, "decimals are rounded to float64"),
+    ):
+        columns = zip(table.column_names, table.schema.types, strict=True)
+        if names := [name for name, kind in columns if name in fields and is_kind(kind)]:
+            lines.append(f"{what}: {', '.join(names)}")
+    return lines
 
 
 def number_stream(
@@ -132,10 +171,15 @@ def number_stream(
     )
 
 
-def table_channels(path: Path) -> list[ExternalChannel]:
-    """Return the columns of a table; raises as `streams`."""
+def table_channels(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
+    """Return the columns of a table, on request refusing words among numbers; as `streams`."""
     table, kind, channels = _read(path), path.suffix[1:], []
-    remarks = (f"{path}: a table has no checksums, so changed numbers cannot be detected",)
+    if whole and kind.lower() == "csv":
+        _refuse_words(path, table, table.column_names)
+    numeric = [name for name in table.column_names if _is_numeric(table[name])]
+    lines = ["a table has no checksums, so changed numbers cannot be detected"]
+    lines += [*_left_out(table, numeric), *_converted(table, numeric)]
+    remarks = tuple(f"{path}: {line}" for line in lines)
     for name, column in zip(table.column_names, table.columns, strict=True):
         info = ChannelInfo(name, kind, str(column.type), len(column) - column.null_count)
         channels.append(ExternalChannel(info, images=False, remarks=remarks))
@@ -172,20 +216,30 @@ def _read_csv(path: Path, numbers: Sequence[str] = ()) -> Any:
         path: the file.
         numbers: names of columns that must be of numbers.
     """
-    from pyarrow import csv, float64
+    from pyarrow import ArrowInvalid, csv, float64
 
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         names = re.sub(r'"[^"]*"', "", file.readline(64 * 1024))
     separator = next((s for s in (",", ";", "\t") if s in names), ",")
-    return csv.read_csv(
-        path,
-        csv.ReadOptions(use_threads=False),  # in several threads errors lack the line
-        csv.ParseOptions(delimiter=separator),
-        csv.ConvertOptions(
-            null_values=[*csv.ConvertOptions().null_values, *_MISSING],
-            column_types=dict.fromkeys(numbers, float64()),
-        ),
-    )
+    try:
+        return csv.read_csv(
+            path,
+            csv.ReadOptions(use_threads=False),  # in several threads errors lack the line
+            csv.ParseOptions(delimiter=separator),
+            csv.ConvertOptions(
+                null_values=[*csv.ConvertOptions().null_values, *_MISSING],
+                column_types=dict.fromkeys(numbers, float64()),
+            ),
+        )
+    except ArrowInvalid as error:
+        if cells := re.search(r"Row #(\d+): Expected (\d+) columns, got (\d+)", str(error)):
+            line, first, here = map(int, cells.groups())
+            what = f"line {line} has {counted(here, 'cell')}, but the first line has {first}"
+        elif word := re.search(r"Row #(\d+): .*invalid value ('.*')", str(error)):
+            what = f"line {word[1]} has {word[2]}, which is not a number"
+        else:
+            raise
+        raise LogDamagedError(f"{path}: {what}: correct the line, or choose --field") from None
 
 
 def _refuse_words(path: Path, table: Any, names: Sequence[str]) -> None:
@@ -208,8 +262,25 @@ def _is_numeric(column: Any) -> bool:
     import pyarrow.types as kinds
 
     kind = column.type
-    numbers = kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind)
-    return bool(numbers) and column.null_count < len(column)
+    tests = (
+        kinds.is_integer,
+        kinds.is_floating,
+        kinds.is_boolean,
+        kinds.is_decimal,
+        kinds.is_duration,
+    )
+    return any(is_kind(kind) for is_kind in tests) and column.null_count < len(column)
+
+
+def _floats(column: Any) -> FloatArray:
+    """Return a numeric column as float64, NaN for null; durations in seconds."""
+    import pyarrow.types as kinds
+
+    if not kinds.is_duration(column.type):
+        return np.array(column.cast("float64", safe=False))
+    return np.array(column.cast("int64").cast("float64", safe=False)) * (
+        UNITS[column.type.unit] / 1e9
+    )
 
 
 def _column(path: Path, table: Any, name: str) -> FloatArray:
@@ -223,7 +294,7 @@ def _column(path: Path, table: Any, name: str) -> FloatArray:
     if first not in table.column_names:
         raise _no_column(path, table, name)
     if first == name and _is_numeric(table[name]):
-        return np.array(table[name].cast("float64", safe=False))[:, None]
+        return _floats(table[name])[:, None]
     try:
         values = table[first].to_pylist()
         rows = [None if value is None else field.numbers({first: value}) for value in values]
@@ -260,8 +331,8 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[IntArray | None, 
     known = np.isfinite(rough)
     if not known.any() or (rough[known] < 0).any() or (rough[known] >= LAST_NS).any():
         raise UsageError(
-            f"{path}: {name} ({table[name].type}) has no times after 1970, as dates or in {unit}: "
-            f"state the unit ({', '.join(UNITS)}), as in --set input.time={name}:ns"
+            f"{path}: {name} ({table[name].type}) has no times from 1970 to 2116, as dates or "
+            f"in {unit}: state the unit ({', '.join(UNITS)}), as in --set input.time={name}:ns"
         )
     if kinds.is_floating(column.type):
         exact = np.round(np.where(known, rough, -1.0)).astype(np.int64)
