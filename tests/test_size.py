@@ -20,7 +20,7 @@ CEILINGS = {
     "cdmisfa/experiments": 2290,
     "cdmisfa/features": 230,
     "cdmisfa/kernels": 2390,
-    "cdmisfa/public": 360,
+    "cdmisfa/public": 365,
     "cdmisfa/studies": 940,
     "recorder": 350,
     "recorder/cameras": 870,

@@ -53,6 +53,8 @@ def as_array(data: Any, name: str = "frames") -> NDArray[Any]:
 def without_table(data: Any, name: str = "frames") -> Any:
     """Return `data`, or the values of a table with NaN for missing ones; see `as_array`."""
     refuse_masked(data, name)
+    if hasattr(data, "toarray"):
+        raise UsageError(f"{name}: the array is sparse: give it as x.toarray()")
     if hasattr(data, "to_frame"):  # one column of pandas or Polars
         data = data.to_frame()
     tabular = hasattr(data, "iloc") or hasattr(data, "__arrow_c_stream__")

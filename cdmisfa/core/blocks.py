@@ -10,6 +10,7 @@ import contextlib
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -339,6 +340,26 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
         raise ValueError(f"stream {stream} does not exist: there are {len(spec.streams)}")
     if n < 1:
         raise ValueError(f"a block has at least one frame, not {n}")
+
+
+def stretches(
+    rows: Sequence[Sequence[Any]], t: int, truth: NDArray[np.float64]
+) -> tuple[Block, ...]:
+    """Return the blocks of consecutive frames of all streams, one for each stretch without a gap.
+
+    Args:
+        rows: frame of each stream at each step, None for a missing one.
+        t: number of the first step.
+        truth: (n, D) truth of the steps, read-only.
+    """
+    blocks: list[Block] = []
+    for stream, column in enumerate(zip(*rows, strict=True)):
+        for is_gap, stretch in groupby(enumerate(column), lambda step: step[1] is None):
+            if not is_gap:
+                steps, frames = zip(*stretch, strict=True)
+                part = truth[steps[0] : steps[-1] + 1]
+                blocks.append(Block(stream, t + steps[0], freeze(np.stack(frames)), part))
+    return tuple(blocks)
 
 
 def unbroken(blocks: Iterable[Block]) -> list[Block]:

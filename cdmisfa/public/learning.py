@@ -9,7 +9,7 @@ import signal
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -65,7 +65,8 @@ def learn(
         source: arrays or tables (see `Recording`), or a mapping of them by stream name; paths,
             URLs or patterns of logs, one or a list; a `Recording`, for logs with options; the name
             of a scene ("oscillatory", "icub"); live streams ("camera:/dev/video0",
-            "gym:CartPole-v1"); or an open source, which stays open.
+            "gym:CartPole-v1"); an iterable of time steps (see `ArraySource`); or an open source,
+            which stays open.
         out: folder of the run; None: a temporary folder, removed with the returned object.
         algorithm: "2.0" (default for scenes), "progress" (default for other streams), "1.0", or
             a class as "package.module:Class".
@@ -190,11 +191,10 @@ def _opened(
     if isinstance(source, FrameSource):
         yield source, _configured(source, how), None
         return
-    streams = {"stream": source} if isinstance(source, Iterator) else source
-    if isinstance(streams, Mapping) and any(isinstance(s, Iterator) for s in streams.values()):
+    if any(map(_is_computed, source.values() if isinstance(source, Mapping) else [source])):
         from recorder.cameras.stepped import ArraySource
 
-        with ArraySource(streams) as array_source:
+        with ArraySource(source) as array_source:
             yield array_source, _configured(array_source, how), None
         return
     if words := as_words(source):
@@ -211,6 +211,12 @@ def _opened(
         for name in recording.inputs.chosen(OPTIONS):
             options[name] = getattr(recording.inputs, name)
         yield frames, configuration, (recording.words, options) if recording.words else None
+
+
+def _is_computed(source: Any) -> bool:
+    """Return whether frames come one after the other, from an iterator or an own source."""
+    whole = isinstance(source, Collection) or hasattr(source, "__arrow_c_stream__")
+    return isinstance(source, Iterable) and not whole
 
 
 def _configured(

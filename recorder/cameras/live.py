@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze, stretches
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.readers import CameraState, Readers, Stamped
@@ -191,16 +190,8 @@ class LiveSource(ForwardSource):
         while len(self._ahead) < n:
             self._ahead.append(self._next_tick())
         rows = [self._ahead.popleft() for _ in range(n)]
-        blocks: list[Block] = []
-        for stream, column in enumerate(zip(*rows, strict=True)):
-            images_at = enumerate(column, self._t)
-            for is_gap, stretch in groupby(images_at, lambda tick: tick[1] is None):
-                if not is_gap:
-                    ticks, images = zip(*stretch, strict=True)
-                    empty = freeze(np.empty((len(images), 0)))
-                    blocks.append(Block(stream, ticks[0], freeze(np.stack(images)), empty))
         self._t += n
-        return tuple(blocks)
+        return stretches(rows, self._t - n, freeze(np.empty((n, 0))))
 
     def describe(self) -> Mapping[str, Any]:
         """Return the identity of the cameras, and how their images become frames."""

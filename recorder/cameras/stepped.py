@@ -12,15 +12,14 @@ from itertools import chain, count, islice
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa.core.arrays import ByteArray, FloatArray, as_array
-from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
+from cdmisfa.core.arrays import ByteArray, FloatArray, as_array, without_table
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze, stretches
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.names import ACTION, BEGINS
-from recorder.images.framing import framings
+from recorder.images.framing import Recipe, default_size, framings, make_frame, size_of
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
 # Largest seed that Gymnasium's spaces accept on every system.
@@ -29,7 +28,7 @@ LARGEST_SEED: Final = 2**31 - 1
 # Frames a second of an environment that does not state a rate.
 DEFAULT_FPS: Final = 30.0
 
-# The frame of each stream, and the ground truth (D,) float64.
+# The frame of each stream, None if it is missing, and the ground truth (D,) float64.
 Step = tuple[Sequence[Any], FloatArray]
 
 # Returns the action for an observation.
@@ -58,65 +57,97 @@ class SteppedSource(ForwardSource):
             raise LogExhaustedError(f"{len(self._ahead)} of {n} frames are left at frame {self._t}")
         steps, self._ahead = self._ahead[:n], self._ahead[n:]
         truth = freeze(np.stack([values for _, values in steps]))
-        blocks = [
-            Block(stream, self._t, freeze(np.stack(frames)), truth)
-            for stream, frames in enumerate(zip(*(frames for frames, _ in steps), strict=True))
-        ]
         self._t += n
-        return tuple(blocks)
+        return stretches([frames for frames, _ in steps], self._t - n, truth)
 
 
 class ArraySource(SteppedSource):
     """Source of frames that a program computes one after the other.
 
-    Use `cdmisfa.Recording` for complete arrays: its source can also go back.
+    A frame is an image, (height, width) or (height, width, 3), or numbers, (I,), of the types that
+    `make_frame` takes. Use `cdmisfa.Recording` for complete arrays: its source can also go back.
 
     Args:
-        streams: mapping of a stream's name to its frames: an array (n, height, width) of uint8 or
-            (n, I) of float64, or any iterable of such frames.
-        fps: frames per second.
+        streams: iterable of time steps, each one frame, or a mapping of a stream's name to its
+            frame, with None for a missing frame; the first step names the streams. Or a mapping of
+            a stream's name to an array or iterable of its frames.
+        size: (height, width) of a frame; None: the `default_size` for the first image.
+        fps: frames per second; None: the attribute `fps` of `streams`, or 50.
         start_ns: log time of frame 0 (ns).
 
     Raises:
-        UsageError: there is no stream, or a frame differs from the first in shape or type, or
+        UsageError: there is no stream, or a frame differs from the first in shape or kind, or
             contains NaN or infinity; raised when the frame is taken.
     """
 
     def __init__(
-        self, streams: Mapping[str, Iterable[Any]], *, fps: float = 50.0, start_ns: int = START_NS
+        self,
+        streams: Iterable[Any] | Mapping[str, Iterable[Any]],
+        *,
+        size: Size | None = None,
+        fps: float | None = None,
+        start_ns: int = START_NS,
     ) -> None:
-        if not isinstance(streams, Mapping) or not streams:
+        given: Iterable[Any] = streams
+        length = None
+        if isinstance(streams, Mapping):
+            known = [len(frames) for frames in streams.values() if isinstance(frames, Sized)]
+            length = min(known, default=None) if len(known) == len(streams) else None
+            rows = zip(*map(without_table, streams.values()), strict=False)
+            given = (dict(zip(streams, row, strict=True)) for row in rows)
+        steps = (step if isinstance(step, Mapping) else {"stream": step} for step in given)
+        first = next(steps, {})
+        frames = [np.atleast_1d(as_array(f, str(n))) for n, f in first.items() if f is not None]
+        if not frames:
             raise UsageError(
-                f"streams are {type(streams).__name__}, or none: give names, as in "
-                '{"left": frames}, with an array (n, height, width) of uint8 or (n, I) of float64, '
-                "or an iterable of such frames"
+                'the first step has no frame: yield an array or {"left": array, ...} for each time '
+                "step"
             )
-        rows = zip(*(map(as_array, frames) for frames in streams.values()), strict=False)
-        first = next(rows, (np.empty(()),))
-        known = [len(frames) for frames in streams.values() if isinstance(frames, Sized)]
-        length = min(known) if len(known) == len(streams) else None
-        shape, dtype = first[0].shape, str(first[0].dtype)
-        spec = SourceSpec(tuple(streams), shape, dtype, (), fps, start_ns, length)
-        steps = _checked(spec, chain([first], rows))
-        super().__init__(spec, chain([next(steps)], steps))  # checks the first frames at once
+        shape = frames[0].shape
+        if len(shape) > 1:
+            shape = size or default_size(size_of(frames[0]))
+        rate = getattr(streams, "fps", 50.0) if fps is None else fps
+        dtype = "uint8" if len(shape) > 1 else "float64"
+        spec = SourceSpec(tuple(map(str, first)), shape, dtype, (), rate, start_ns, length)
+        self.gaps = length is None
+        framed = _framed(spec, tuple(first), chain([first], steps))
+        super().__init__(spec, chain([next(framed)], framed))  # checks the first frames at once
 
     def describe(self) -> Mapping[str, Any]:
         """Return the kind of the source, and the names of its streams."""
         return {"kind": "arrays", "streams": list(self._spec.streams)}
 
 
-def _checked(spec: SourceSpec, rows: Iterable[Sequence[NDArray[Any]]]) -> Iterator[Step]:
-    """Check frames of all streams for shape, type and finite values, and yield them."""
-    for t, row in enumerate(rows):
-        for name, frame in zip(spec.streams, row, strict=True):
-            alike = frame.shape == spec.frame_shape and str(frame.dtype) == spec.dtype
-            if not alike or (spec.dtype, frame.ndim) not in (("uint8", 2), ("float64", 1)):
-                raise UsageError(
-                    f"frame {t} of {name} is {frame.dtype} {frame.shape}: give frames (height, "
-                    "width) of uint8 or (I,) of float64, with one shape and type for all streams"
-                )
-            if frame.ndim == 1 and not np.isfinite(frame).all():
-                raise UsageError(f"frame {t} of {name} has NaN or infinity: fill it in or omit it")
+def _framed(
+    spec: SourceSpec, names: Sequence[Any], steps: Iterable[Mapping[Any, Any]]
+) -> Iterator[Step]:
+    """Convert the frames of all streams to the shape and type of the first, and yield them."""
+    recipe = Recipe(spec.frame_shape)
+    for t, step in enumerate(steps):
+        if unknown := [name for name in step if name not in names]:
+            raise UsageError(
+                f"frame {t} is of a stream {unknown[0]}, which the first step does not name: give "
+                f"None for {unknown[0]} there"
+            )
+        row: list[Any] = []
+        for name in names:
+            frame = step.get(name)
+            if frame is not None:
+                array = np.atleast_1d(as_array(frame, f"frame {t} of {name}"))
+                about = f"frame {t} of {name} is {array.dtype} {array.shape}"
+                numbers = array.dtype.kind in "biuf" and array.shape == spec.frame_shape
+                if not spec.images and not numbers:
+                    raise UsageError(f"{about}: give numbers {spec.frame_shape}, as the first")
+                if not spec.images and not np.isfinite(array).all():
+                    raise UsageError(
+                        f"frame {t} of {name} has NaN or infinity: fill it in, or give None for a "
+                        "missing frame"
+                    )
+                try:
+                    frame = make_frame(array, recipe)
+                except UsageError as error:
+                    raise UsageError(f"{about}: {error}") from None
+            row.append(frame)
         yield row, np.empty(0)
 
 
