@@ -54,16 +54,27 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         build_overlay(runs, side_by_side(runs), out, force=True, tab="nowhere")
 
 
-def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):
+def test_the_command_exits_with_4_if_runs_differ(three, tmp_path, cdmisfa):
     (a, b, c), _ = three
     assert cdmisfa("compare", a, b).code == 0
     assert cdmisfa("compare", a, c).code == 4
     done = cdmisfa("compare", a, b, c, "--save", tmp_path / "v.rrd")
-    assert done.code == 0
+    assert done.code == 4
     assert done.out.count("identical, bit for bit") == 1
     assert "iteration 0" in done.out
     assert (tmp_path / "v.rrd").is_file()
     assert cdmisfa("compare", a).code == 2
+
+
+def test_settings_of_runs_with_the_same_signals_are_compared(tmp_path, cdmisfa):
+    runs = [tmp_path / "a", tmp_path / "b"]
+    for run, alpha in zip(runs, (0.005, 0.006), strict=True):
+        words = ("--max-iterations", 2, "--set", f"learner.alpha={alpha}", "--no-rerun")
+        assert cdmisfa("learn", "oscillatory", *words, "-o", run).code == 0
+    done = cdmisfa("compare", *runs)
+    assert done.code == 0
+    settings = "settings changed in b: learner.alpha 0.005 -> 0.006"
+    assert done.out == f"identical, bit for bit\n{settings}\n"
 
 
 def write_changed(path, iteration, name, change):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 
 import pytest
+from conftest import Cdmisfa
 from mcap.writer import CompressionType, Writer
 
 from recorder.mcap.reader import LogReader
@@ -107,3 +109,54 @@ def test_a_damaged_chunk_costs_itself_whatever_else_is_damaged(tmp_path: Path) -
         assert messages(out) == [m for m in true if not chunk.start <= m[1] <= chunk.end]
         assert any(chunk.name in problem.where for problem in result.lost)
         assert sum(c.lost or 0 for c in result.channels) == MESSAGES - len(messages(out))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_recovered_file_is_whole_and_has_all_messages_outside_the_damage(
+    cdmisfa: Cdmisfa,
+    tmp_path: Path,
+    oscillatory_recording: Path,
+    oscillatory_run: Path,
+    seed: int,
+) -> None:
+    random = Random(seed)
+    for original in (oscillatory_recording / "x2.mcap", oscillatory_run / "run.mcap"):
+        folder, out = tmp_path / original.stem, tmp_path / f"{original.stem} recovered"
+        raw = (file := shutil.copytree(original.parent, folder) / original.name).read_bytes()
+        with LogReader(original) as reader:
+            place = random.randrange(reader.segments[0].stop, reader.data_end)
+            intact = [s for s in reader.segments if s.stop <= place]
+            damaged, later = raw[:place], []
+            if seed % 2:
+                damaged = flipped(raw, 8 * place + random.randrange(8))
+                later = [s for s in reader.segments if s.offset > place]
+            tables = [reader.table(segment) for segment in (*intact, *later)]
+        least = sum(len(table) for table in tables if table is not None)
+        file.write_bytes(damaged)
+        assert cdmisfa("verify", folder).code == 3
+        assert cdmisfa("recover", folder, "-o", out).code in (0, 3)
+        assert cdmisfa("verify", out / original.name).code == 0
+        assert cdmisfa("verify", out).code == 0
+        saved, every = messages(out / original.name), messages(original)
+        assert len(saved) >= least
+        assert not set(saved) - set(every)
+        if original.parent == oscillatory_recording:
+            assert cdmisfa("learn", out, "--max-iterations", 5).code == 0
+
+
+def test_a_log_that_ends_before_its_first_message_gives_no_file(
+    cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_recording: Path
+) -> None:
+    with LogReader(oscillatory_recording / "x1.mcap") as reader:
+        end = reader.segments[0].offset
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for name, size in (("x1.mcap", end), ("x2.mcap", end + 5), ("x3.mcap", 30)):
+        (folder / name).write_bytes((oscillatory_recording / name).read_bytes()[:size])
+        done = cdmisfa("recover", folder / name, "-o", tmp_path / name)
+        assert (done.code, "no message can be recovered" in done.err) == (3, True)
+        assert not list(tmp_path.glob("*.mcap*"))
+    assert cdmisfa("recover", folder, "-o", tmp_path / "out").code == 3
+    shutil.copy(oscillatory_recording / "x2.mcap", folder)
+    assert cdmisfa("recover", folder, "-o", tmp_path / "out").code == 3
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["x2.mcap"]

@@ -306,6 +306,10 @@ def test_the_command_prints_one_document_and_names_failed_trials(
     assert {row["point"]["learner.tau"] for row in document["failed"]} == {"2000"}
     assert all("frames" in row["error"] for row in document["failed"])
     summary = cdmisfa("sweep", tmp_path / "s", "--summary", "--json").json["points"][0]
+    assert "leaves out" not in outcome.err
+    words = [str(tmp_path / "log"), "--algorithm", "progress", "--seeds", "0:1"]
+    outcome = cdmisfa("sweep", *words, "--max-iterations", "3", "-o", str(tmp_path / "s"))
+    assert "--summary leaves out 4 trials" in outcome.err
     # The log has 10 blocks of 100 frames.
     assert (summary["done"], summary["measures"]["iterations"]["mean"]) == (2, 10.0)
 

@@ -241,6 +241,11 @@ def settings(
     return click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help=help)
 
 
+algorithm = option(
+    "--algorithm NAME",
+    "Use this learner: progress, 2.0 or 1.0 (of the paper), or your package.module:Class. "
+    "[default: 2.0 for scenes and their recordings, else progress]",
+)
 max_iterations = option(
     "--max-iterations N", "Stop after this number of iterations. [default: no limit]"
 )

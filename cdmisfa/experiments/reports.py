@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.experiments.run_folder import command_again
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless
@@ -27,7 +27,8 @@ def write_report(
 
     Raises:
         UsageError: a run does not exist, or the file exists.
-        LogDamagedError: not even the header of a log can be read.
+        LogDamagedError: a run is damaged; if its header is readable, the file of the readable part
+            was written.
         LogWriteError: the file cannot be written.
     """
     paths = [Path(word) for word in words]
@@ -39,14 +40,18 @@ def write_report(
     refuse_taken(out, force=force)
     from replay.report.page import report_of_run, report_of_runs
 
+    damage: list[str] = []
     if len(paths) > 1:
         page = report_of_runs(paths, f"{len(paths)} runs compared")
     elif runs := runs_in(paths[0]):
         page = report_of_runs(runs, f"{paths[0].resolve().name}: {len(runs)} runs")
     else:
-        page = report_of_run(paths[0], _reproducible(paths[0]), command_again(paths[0]))
+        again = _reproducible(paths[0]), command_again(paths[0])
+        page, damage = report_of_run(paths[0], *again)
     with atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
+    if damage:
+        raise LogDamagedError(f"{out} was written. {damage[0]}")
     return out
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.files import make_folder, refuse_unless
 from recorder.log.logfile import LogFile
+from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import UNUSED, MessageTable, chunk_records, walked_table
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segment
@@ -24,6 +25,7 @@ from recorder.mcap.store import PARTIAL, Store
 from replay.integrity.info import ChannelCount, problems_of
 from replay.integrity.report import SCHEMA
 from replay.logs.open_logs import is_external_format
+from replay.runs.folders import FINAL_METADATA
 from replay.storage.location import location
 from replay.storage.paths import log_files
 
@@ -96,7 +98,9 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: input and output are the same file; choose another output")
-    results = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
+    results = [_recover_file(f, t, force) for f, t in zip(files, targets, strict=True)]
+    if not any(result.channels or result.complete for result in results):
+        raise LogDamagedError(f"{src}: no message can be recovered; no file was written")
     return Recovery(
         out=str(dst),
         channels=tuple(c for result in results for c in result.channels),
@@ -106,7 +110,7 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
     )
 
 
-def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
+def _recover_file(src: Path, dst: Path, force: bool) -> Recovery:
     with ExitStack() as stack:
         reader = stack.enter_context(LogReader(src, skip_damaged=True))
         repaired: list[Problem] = []
@@ -114,30 +118,28 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             store = repair(reader)
             repaired = [Problem(f"{src}: {p.where}", p.what) for p in store.repaired]
             reader = stack.enter_context(LogReader(store, skip_damaged=True))
-        empty = not (reader.channels or reader.metadata or reader.attachments)
-        if alone and reader.missing and empty:  # in a folder, other logs may hold something
-            raise LogDamagedError(f"{src}: no message can be recovered; no file was written")
+        if not any(len(table) for _, table in reader.tables()) and (lost := _lost(reader)):
+            return Recovery(str(dst), (), lost, (), 0)
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             saved, unverified = _copy(reader, log)
-        lost = _lost_messages(reader, saved)
+            lost, counts = _lost(reader), _lost_messages(reader, saved)
+            _copy_metadata(reader, log, complete=not lost)
         channels = tuple(
             ChannelRecovery(
-                reader.channels[n].topic, count.messages, lost[n], count.start, count.end, dst.name
+                reader.channels[n].topic, c.messages, counts[n], c.start, c.end, dst.name
             )
-            for n, count in sorted(saved.items())
+            for n, c in sorted(saved.items())
         )
-        return Recovery(str(dst), channels, _lost(reader), tuple(repaired), unverified)
+        return Recovery(str(dst), channels, lost, tuple(repaired), unverified)
 
 
 def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, ChannelCount], int]:
-    """Write the readable records.
+    """Write the readable attachments and messages.
 
     Returns:
         The saved messages of each channel, and the number of messages without a checksum.
     """
-    for record in reader.metadata:
-        log.add_metadata(record.name, record.metadata)
     for attachment in reader.attachments:
         log.add_attachment(
             attachment.name,
@@ -173,6 +175,16 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, ChannelCount], int
         for number in saved.keys() & np.unique(table.channel).tolist():
             saved[number].add(table.log_time[table.channel == number])
     return saved, unverified
+
+
+def _copy_metadata(reader: LogReader, log: LogFile, *, complete: bool) -> None:
+    """Write the metadata; that of an incomplete recording states that frames can be missing."""
+    for record in reader.metadata:
+        values = dict(record.metadata)
+        if record.name == RECORDING_METADATA and not complete:
+            values["gaps"] = str(True)
+        if record.name != FINAL_METADATA or complete:  # it has the checksum of all signals of a run
+            log.add_metadata(record.name, values)
 
 
 def _lost(reader: LogReader) -> tuple[Problem, ...]:

@@ -100,7 +100,8 @@ class LoggedSource(StoredSource):
     def _open(self) -> None:
         """Put the streams on one clock, and find out how an image becomes a frame."""
         if self.recorded:
-            facts = self.streams[0].views[0].facts
+            views = [view.facts for stream in self.streams for view in stream.views]
+            facts = replace(views[0], gaps=any(view.gaps for view in views))
             self._clock = clock = clocks.by_number(self.coverage().values(), facts, self._name())
         else:
             self.streams, self._fps, clock = align(self.streams, self._options)
@@ -228,6 +229,11 @@ class LoggedSource(StoredSource):
         for stream in self.streams:
             yield from stream.warnings
         clock = self._clock
+        handling = "no block spans a gap" if self.gaps else "the last image is repeated"
+        for stream, gaps in zip(self.streams, clock.gaps, strict=True):
+            if gaps:
+                line = clocks.gaps_in_words(gaps, self._spec.fps)
+                yield f"{stream.path}: {stream.topic} has {line}: {handling}"
         if self.recorded:
             lasts = [stream.views[-1].ranges for stream in self.streams]
             ends = {ranges[-1][1] for ranges in lasts if ranges}
@@ -242,11 +248,6 @@ class LoggedSource(StoredSource):
                     f"{self._name()}: {left_out} frames that a view lacks are skipped in all views"
                 )
             return
-        handling = "no block spans a gap" if self.gaps else "the last image is repeated"
-        for stream, gaps in zip(self.streams, clock.gaps, strict=True):
-            if gaps:
-                line = clocks.gaps_in_words(gaps, self._fps)
-                yield f"{stream.path}: {stream.topic} has {line}: {handling}"
         one = self.streams[0]
         assert one.times is not None
         by_number = self._options.align is None and not self._arrays

@@ -35,8 +35,8 @@ CURVES = {
 }
 
 
-def report_of_run(path: Path, reproducible: str = "not checked", again: str = "") -> str:
-    """Return the page of a run.
+def report_of_run(path: Path, reproducible: str, again: str) -> tuple[str, list[str]]:
+    """Return the page of a run, and a sentence for each damage of its files.
 
     Args:
         path: folder or log of the run.
@@ -49,10 +49,11 @@ def report_of_run(path: Path, reproducible: str = "not checked", again: str = ""
     """
     page = ""
     for frames in FRAMES:
-        page = _rendered(run_content(RunData(path, frames), reproducible, again))
+        data = RunData(path, frames)
+        page = _rendered(run_content(data, reproducible, again))
         if len(page.encode()) < MOST_BYTES:
             break
-    return page
+    return page, data.damage
 
 
 def report_of_runs(paths: Sequence[Path], title: str) -> str:

@@ -113,6 +113,7 @@ class RunData:
         watched: (n,) frames and (n, *frame_shape) values, thinned.
         last: the last image of each stream, or its last rows of numbers.
         problems: a sentence for each damage or missing file.
+        damage: sentences about damage.
     """
 
     def __init__(self, path: Path, frames: int) -> None:
@@ -143,6 +144,7 @@ class RunData:
                 self._add(batch)
         except LogDamagedError as error:
             self.problems.append(f"The log is damaged; this page shows its readable part: {error}")
+        self.damage = self.problems[0 if run.result else 1 :]
         self.outline = tally.outline()
 
     def _add(self, batch: Batch) -> None:

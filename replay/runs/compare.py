@@ -293,13 +293,13 @@ def side_by_side(runs: Sequence[Path]) -> tuple[ComparedRun, ...]:
         outline = read_outline(run)
         if not rows:
             rows.append(ComparedRun(name, outline, None))
-        elif (difference := first_difference(runs[0], run)) is None:
-            rows.append(ComparedRun(name, outline, None, IDENTICAL))
-        else:
-            phrase = verdict(rows[0].outline, outline)
-            versions = different_versions(runs[0], run)
-            settings = different_settings(runs[0], run)
-            rows.append(ComparedRun(name, outline, difference, phrase, versions, settings))
+            continue
+        difference, settings = first_difference(runs[0], run), different_settings(runs[0], run)
+        phrase = verdict(rows[0].outline, outline) if difference else IDENTICAL
+        versions = different_versions(runs[0], run) if difference else ()
+        if difference is None:  # a source with the same signals may be a copy or a recording
+            settings = tuple(s for s in settings if not s[0].startswith("source"))
+        rows.append(ComparedRun(name, outline, difference, phrase, versions, settings))
     return tuple(rows)
 
 

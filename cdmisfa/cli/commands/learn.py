@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 @options.seed
 @options.preset
 @options.settings()
-@options.option("--algorithm NAME")
+@options.algorithm
 @options.max_iterations
 @options.max_modules
 @options.loop
@@ -89,8 +89,6 @@ def learn_command(
         preset     a named set of configuration values
 
     Options:
-        --algorithm NAME: Use this learner: progress, 2.0 or 1.0 (of the paper), or your
-            package.module:Class. [default: 2.0 for scenes and their recordings, else progress]
         --resume: Continue the interrupted run in the folder -o; SOURCE and options may be left out.
         --live-view: Show the run in the Rerun viewer while it learns.
         --episodes: Learn from the logs one after the other; no block crosses from one to the next.

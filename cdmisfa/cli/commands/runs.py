@@ -26,9 +26,8 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
     """Compare runs: signals bit for bit, results and settings.
 
     Signals are the values that the learner computed in each iteration. For two runs, the command
-    prints where their signals first differ and which settings and results differ; if any signal
-    differs, the exit code is 4. For more runs, it prints a table that compares each with the
-    first; the exit code is then 0.
+    prints where their signals first differ and which settings and results differ. For more runs, it
+    prints a table that compares each with the first. The exit code is 4 if any signal differs.
 
     RUN is one of:
         {run}
@@ -65,7 +64,7 @@ def compare_command(runs: tuple[Path, ...], save: Path | None, force: bool, as_j
         if save is not None:
             command = f"cdmisfa view {printing.quoted(save)}"
             printing.status(f"view written to {save}; open it with {command}")
-    return NotReproducedError.exit_code if different and len(runs) == 2 else 0
+    return NotReproducedError.exit_code if different else 0
 
 
 def _print_comparison(rows: Sequence[ComparedRun]) -> None:

@@ -6,7 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from click.core import ParameterSource
 
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.progress import Bar, bar, resumable_bar
+from cdmisfa.core.errors import CdmisfaError
 
 # Number of seeds of a sweep, so that a typing error does not fill the memory.
 MOST_SEEDS = 1_000_000
@@ -29,6 +30,7 @@ MOST_SEEDS = 1_000_000
 @options.option("--seeds FIRST:END", default="0:20", show_default=True)
 @options.preset
 @options.settings()
+@options.algorithm
 @options.max_iterations
 @options.max_modules
 @options.loop
@@ -49,6 +51,7 @@ def sweep_command(
     output: Path | None,
     grid: tuple[str, ...],
     seeds: str,
+    algorithm: str | None,
     summary: bool,
     csv: bool,
     as_json: bool,
@@ -90,10 +93,17 @@ def sweep_command(
         raise click.UsageError("name the folder of the sweep with -o, or print one with --summary")
     from cdmisfa.experiments.sweep import sweep
 
-    values, numbers = parse_grid(grid), parse_seeds(seeds)
+    values, numbers, before = parse_grid(grid), parse_seeds(seeds), _requested(output)
+    if algorithm is not None:
+        arguments["settings"] += (f"learner.algorithm={algorithm}",)
     with resumable_bar(output, "sweep", "trials") as progress_bar:
         report = sweep(
             source, output, grid=values, seeds=numbers, progress=progress_bar.trials, **arguments
+        )
+    if left_out := len(before - _requested(output)):
+        printing.status(
+            f"{output}: --summary leaves out {left_out} trials of the command before, which "
+            "are not in this one"
         )
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
@@ -114,6 +124,15 @@ def sweep_command(
             printing.line(f"failed: {point} seed {row['seed']}: {row['error']}")
         printing.line(f"print the results with cdmisfa sweep {printing.quoted(output)} --summary")
     return 1 if failed else 0
+
+
+def _requested(folder: Path) -> set[str]:
+    """Return the ids of the trials of the last command in a folder; none if there is no sweep."""
+    from replay.runs.folders import read_request
+
+    with suppress(CdmisfaError):
+        return {trial for trial, _ in read_request(folder)}
+    return set()
 
 
 def parse_grid(words: tuple[str, ...]) -> dict[str, list[str]]:

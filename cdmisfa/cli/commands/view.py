@@ -107,7 +107,8 @@ def report_command(run: tuple[Path, ...], output: Path | None, force: bool, as_j
 
     The page shows what was learned and when, which stream the learner attended to, why the run
     ended, and whether it is reproducible. It is one file and needs no network. cdmisfa learn writes
-    the same page as report.html into its run.
+    the same page as report.html into its run. The page of a damaged run shows its readable part;
+    the exit code is then 3.
 
     RUN is one of:
         {run}

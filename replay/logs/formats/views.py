@@ -31,7 +31,7 @@ _SMALLEST: Final = 64
 SCENE_KEYS: Final = ("scene", "seed", "config_sha256")
 
 # Keys that are the same in all files of a recording.
-_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *SCENE_KEYS)
+_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", *SCENE_KEYS)
 
 
 class SeveralRecordingsError(UsageError):
@@ -104,7 +104,7 @@ def _arrange(views: Sequence[ViewFile], *, skip_damaged: bool) -> list[list[View
         for one, two in itertools.pairwise(parts):
             end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
             begins = two.facts.first_frame
-            if end > begins or (end < begins and not skip_damaged):
+            if end > begins or (end < begins and not (skip_damaged or one.facts.gaps)):
                 what = f"begins at frame {begins}, but {one.path.name} ends before frame {end}"
                 raise _unfit(views, two, f"{what}: a part is missing or duplicated")
         arranged.append(parts)
