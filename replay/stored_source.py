@@ -94,15 +94,10 @@ class StoredSource(ClockedSource):
         return self.end + (self.passes - 1) * self.lap
 
     def repeat(self, passes: int) -> None:
-        """Return the frames this number of times; call it after `hold_out`.
-
-        Raises:
-            UsageError: the source loops.
-        """
-        if self._loop and passes > 1:
-            raise UsageError(f"{self._name()}: it is repeated without end, and not {passes} times")
-        self.passes = passes
-        self._spec = replace(self._spec, length=self.last - self.first_frame)
+        """Return the frames this number of times, unless they loop; call it after `hold_out`."""
+        if not self._loop:
+            self.passes = passes
+            self._spec = replace(self._spec, length=self.last - self.first_frame)
 
     def hold_out(self, count: int) -> None:
         """Keep the last frames from `take`: modules are judged on them, see `pieces`.
@@ -153,7 +148,7 @@ class StoredSource(ClockedSource):
         check_request(self._spec, 0, n)
         stop = self._t + n
         if not self._loop and stop > self.last:
-            raise self._exhausted(n)
+            raise self._exhausted(n, self.end - self.first_frame)
         blocks = tuple(
             self._centred(stream, low, high - low)
             for stream in range(len(self._spec.streams))
@@ -213,8 +208,8 @@ class StoredSource(ClockedSource):
             raise ValueError(f"frame {t} lies before the first, {self.first_frame}")
         if not self._loop and t > self.last:
             raise LogExhaustedError(
-                f"{self._name()}: it ends at frame {self.last}, before frame {t}; repeat it "
-                "with --loop"
+                f"{self._name()}: it ends at frame {self.last}, before frame {t}; read it more "
+                "often with --passes"
             )
         self._t = t
 
@@ -325,17 +320,24 @@ class StoredSource(ClockedSource):
         for low, high in self._in_passes(stream, self._t, end, self.frames - self.held_out):
             if high - low >= n:
                 return low
-        raise self._exhausted(n)
+        spans = self._in_passes(stream, self.first_frame, self.end, self.frames - self.held_out)
+        raise self._exhausted(n, max((high - low for low, high in spans), default=0))
 
-    def _exhausted(self, n: int) -> LogExhaustedError:
+    def _exhausted(self, n: int, longest: int) -> LogExhaustedError:
+        """Return the error for too few frames; the longest stretch of a pass has `longest`."""
+        reserved = f", before {self.held_out} held-out frames" if self.held_out else ""
+        if longest < n and self.gaps:
+            return LogExhaustedError(
+                f"{self._name()}: a block has {n} frames, but the longest part without a gap has "
+                f"{longest}{reserved}; {self.more}set a smaller learner.tau"
+            )
         if self.passes > 1 and self.passes_begun > 1:
             return LogExhaustedError(f"{self._name()} was read {self.passes} times")
         left = max(self.end - self._t, 0)
-        unbroken = " without a gap" if self.gaps else ""
-        reserved = f", before {self.held_out} held-out frames" if self.held_out else ""
+        remedy = "read it more often with --passes" if longest >= n else "repeat it with --loop"
         return LogExhaustedError(
             f"{self._name()}: {left} frames are left at frame {self._t}{reserved}, but a block "
-            f"has {n}{unbroken}; {self.more}repeat it with --loop"
+            f"has {n}{' without a gap' if self.gaps else ''}; {self.more}{remedy}"
         )
 
 

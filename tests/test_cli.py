@@ -156,7 +156,7 @@ class TestRuns:
         assert done.code == 0
         assert "the source ended: " in done.err
         assert "0 frames are left at frame 2000" in done.err
-        assert "--loop" in done.err
+        assert "--passes" in done.err
         assert re.search(f"^{line}$", done.out, re.MULTILINE)
         assert f"ended after {blocks} iterations: the source has no more frames" in done.out
         result = json.loads((run / "run.json").read_text())["result"]

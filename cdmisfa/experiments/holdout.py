@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
-from cdmisfa.experiments.sources import CAMERA_LEARNER, Configuration
+from cdmisfa.experiments.sources import CAMERA_LEARNER, PASSES, Configuration
 from cdmisfa.features.following import batch_outputs, following_slowness
 from cdmisfa.modules import Module
 from replay.stored_source import StoredSource
@@ -28,67 +28,51 @@ HOLDOUT = 0.1
 # by hand.
 MIN_HELD_OUT = 200
 
-# Default number of passes of the progress learner over a log. Set by hand: it repeats a log of
-# 1,500 frames for 750 blocks, and most streams are decided within 200.
-PASSES = 20
-
 
 class _StoppedError(Exception):
     """Request of the user to stop the run."""
 
 
-def hold_out(source: FrameSource, configuration: Configuration) -> None:
-    """Keep the last frames of a log from the progress learner, to evaluate its modules on them.
+def arrange_frames(
+    source: FrameSource, configuration: Configuration, passes: int | None = None
+) -> None:
+    """Hold out the last frames of a log, and let the run read the others several times.
+
+    Modules of the progress learner are evaluated on the frames that are held out. A run reads the
+    others again until each stream is decided.
 
     Args:
         source: the source of the run.
-        configuration: its key `input.holdout` is the share; None: `HOLDOUT`, if possible.
-
-    Raises:
-        UsageError: a share is set, and nothing can be held out.
-    """
-    share = None if configuration.inputs is None else configuration.inputs.holdout
-    if share == 0.0:
-        return
-    by_progress = configuration.learner.algorithm == CAMERA_LEARNER
-    logged = isinstance(source, StoredSource) and source.to_judge
-    if not by_progress or not logged or source.spec.length is None:
-        if share is not None:
-            raise UsageError(
-                "input.holdout needs logs from which the progress learner learns once: remove it, "
-                "or remove --loop and --algorithm"
-            )
-        return
-    assert isinstance(source, StoredSource)
-    count = int(source.frames * (HOLDOUT if share is None else share))
-    if count >= MIN_HELD_OUT:
-        source.hold_out(count)
-    else:
-        few = f"{count} of {source.frames} frames are too few to test on"
-        source.notes = (*source.notes, f"{few}: none are held out (input.holdout)")
-
-
-def repeat(source: FrameSource, configuration: Configuration, passes: int | None = None) -> None:
-    """Let a run read a log several times, unless each stream is decided before.
-
-    Args:
-        source: the source of the run, after `hold_out`.
-        configuration: its learner decides the default.
+        configuration: its key `input.holdout` is the share that is held out; None: `HOLDOUT`, if
+            possible.
         passes: number of passes; None: `PASSES` for the progress learner on logs and arrays, but
             not on recordings of a scene; else 1.
 
     Raises:
-        UsageError: a number is set, and the source does not end or cannot go back.
+        UsageError: a share is set, and nothing can be held out; or a number of passes is set, and
+            the source does not end or cannot go back.
     """
+    share = None if configuration.inputs is None else configuration.inputs.holdout
+    by_progress = configuration.learner.algorithm == CAMERA_LEARNER
     finite = isinstance(source, StoredSource) and source.spec.length is not None
-    if passes is None:
-        by_progress = configuration.learner.algorithm == CAMERA_LEARNER
-        passes = PASSES if finite and by_progress and configuration.streams else 1
-    if passes > 1 and not finite:
-        raise UsageError("--passes needs logs that are read without --loop: remove one of them")
-    if passes > 1:
-        assert isinstance(source, StoredSource)
-        source.repeat(passes)
+    if passes is not None and not finite:
+        raise UsageError("--passes is for logs and arrays, without --loop: remove one of them")
+    if share and not (finite and by_progress and getattr(source, "to_judge", False)):
+        raise UsageError(
+            "input.holdout needs logs from which the progress learner learns: remove it, or remove "
+            "--loop and --algorithm"
+        )
+    if not isinstance(source, StoredSource) or not finite:
+        return
+    count = 0
+    if by_progress and source.to_judge and share != 0.0:
+        count = int(source.frames * (share or HOLDOUT))
+        if count < MIN_HELD_OUT:
+            few = f"{count} of {source.frames} frames are too few to test on"
+            source.notes = (*source.notes, f"{few}: none are held out (input.holdout)")
+            count = 0
+    source.hold_out(count)
+    source.repeat(passes or (PASSES if by_progress and configuration.streams else 1))
 
 
 def evaluate(

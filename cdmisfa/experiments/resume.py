@@ -213,7 +213,7 @@ class Recomputation:
         if isinstance(source, StoredSource):
             if stated.get("held_out"):
                 source.hold_out(stated["held_out"])
-            source.passes = stated.get("passes", 1)
+            source.repeat(stated.get("passes", 1))
         self._source = source
         source.seek(self.t)
         return source

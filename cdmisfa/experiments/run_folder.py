@@ -14,9 +14,10 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import build
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
+from cdmisfa.core.outcomes import EXHAUSTED
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.documents import machine, write_json, writing
-from cdmisfa.experiments.sources import open_logs
+from cdmisfa.experiments.sources import PASSES, open_logs
 from cdmisfa.modules import Module
 from recorder.cameras.words import is_live
 from recorder.config import RecordConfig
@@ -196,6 +197,14 @@ class RunResult:
     ended: str
     undecided: tuple[str, ...]
     passes: int | None = None
+
+    @property
+    def more_passes(self) -> int:
+        """Number of passes to continue with, if streams need more; else 0."""
+        ended = self.ended == EXHAUSTED and not self.source.get("loop")
+        # In a log that ends in an earlier pass, all parts between two gaps are too short.
+        last = self.passes is not None and self.passes == self.source.get("passes", 1)
+        return max(2 * (self.passes or 0), PASSES) if self.undecided and ended and last else 0
 
     def as_json(self) -> dict[str, Any]:
         """Return the result as `learn --json` prints it."""

@@ -46,6 +46,10 @@ from replay.runs.log import read_header
 from replay.runs.provenance import comparable, has_whole_hashes, stated_source
 from replay.runs.writer import RunWriter
 
+# Facts that may differ when a run is resumed: the first passes over a log are the same, however
+# many follow.
+OF_PASSES = ("source.passes", "spec.length")
+
 # Called with the number of bytes of the source that were hashed, and the total.
 Hashing = Callable[[int, int], None]
 
@@ -141,7 +145,11 @@ class Session:
         spec_then, spec_now = map(dataclasses.asdict, (header.spec, self.source.spec))
         then = {**header.manifest, "source": source_then, "spec": spec_then, COMMAND: None}
         now = {**as_json, "source": source_now, "spec": spec_now, COMMAND: None}
-        changed = {key.removeprefix("config."): values for key, *values in differences(then, now)}
+        changed = {
+            key.removeprefix("config."): values
+            for key, *values in differences(then, now)
+            if key not in OF_PASSES
+        }
         if changed:
             # Another learner has other keys, so its name is the reason for all differences.
             key = "learner.algorithm" if "learner.algorithm" in changed else next(iter(changed))

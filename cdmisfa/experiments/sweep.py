@@ -20,7 +20,7 @@ from cdmisfa.agents.learners import LEARNERS, learner_class
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
-from cdmisfa.experiments.holdout import repeat
+from cdmisfa.experiments.holdout import arrange_frames
 from cdmisfa.experiments.run_folder import module_table, with_recipes
 from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import (
@@ -102,7 +102,7 @@ def plan(
         preset: preset to use instead of that of the source.
         settings: `section.key=value` words for all trials.
         loop: True to start a log again at its end.
-        passes: see `repeat`.
+        passes: see `arrange_frames`.
         inputs: how images of logs become frames; see `open_source`.
         limits: `max_iterations` and `max_modules`, at which each trial ends.
 
@@ -170,7 +170,7 @@ def compute_trial(
         configuration: the configuration with the point of the grid and the seed.
         opening: `loop` and `inputs` of `open_logs`.
         seed: seed of the trial.
-        passes: see `repeat`.
+        passes: see `arrange_frames`.
         limits: `max_iterations` and `max_modules`.
 
     Returns:
@@ -191,7 +191,7 @@ def compute_trial(
                 "epsilon": result.epsilon,
                 "ended": result.ended,
             }
-        repeat(opened, configuration, passes)
+        arrange_frames(opened, configuration, passes)
         options: dict[str, Any] = {"seed": seed, "sections": configuration.tables()}
         learned = run_session(opened, configuration.learner, rerun=False, **options, **limits)
     return {key: value for key, value in learned.as_json().items() if key not in DROPPED_KEYS}

@@ -16,7 +16,7 @@ from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.learning import Sink
-from cdmisfa.experiments.holdout import hold_out, repeat
+from cdmisfa.experiments.holdout import arrange_frames
 from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.session import run_session
 from cdmisfa.experiments.sources import (
@@ -107,8 +107,7 @@ def learn(
         _folder(out) as folder,
         _interruptible(folder, stop) as stop,
     ):
-        hold_out(frames, configuration)
-        repeat(frames, configuration, passes)
+        arrange_frames(frames, configuration, passes)
         if command is not None:
             command = command_of(command[0], {**how, **ends, **command[1]}, folder)
         if hasattr(frames, "stop"):

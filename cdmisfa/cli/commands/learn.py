@@ -161,7 +161,7 @@ def _opened_source(
     words: Sequence[str], output: Path | None, record_to: Path | None, force: bool, **arguments: Any
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """Open a source, with the arguments of `open_source`; print its notes and warnings."""
-    from cdmisfa.experiments.holdout import hold_out, repeat
+    from cdmisfa.experiments.holdout import arrange_frames
     from cdmisfa.experiments.run_folder import OPENING
     from cdmisfa.experiments.sources import is_scene, open_source
     from recorder.cameras.words import is_live
@@ -184,9 +184,8 @@ def _opened_source(
         )
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(frames))
+        arrange_frames(frames, configuration, passes)
         if not live:
-            hold_out(frames, configuration)
-            repeat(frames, configuration, passes)
             printing.source(frames)
         stack.callback(printing.source_changes, frames)
         if record_to is not None:
@@ -233,17 +232,22 @@ def _print_run(
         if folder and can_resume:
             printing.status(f"continue with cdmisfa learn --resume -o {folder}")
         return stop.exit_code
-    if result.run is None:
-        return 0
-    try:
-        page = write_report([result.run])
-    except Exception as error:  # the run is complete, even if its report cannot be written
-        printing.warning(
-            f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
+    if result.run is not None:
+        try:
+            page = write_report([result.run])
+        except Exception as error:  # the run is complete, even if its report cannot be written
+            printing.warning(
+                f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
+            )
+        else:
+            if warnings is None:
+                printing.line(f"report written to {page}")
+    if more := result.more_passes:
+        again = f"continue with cdmisfa learn --resume --passes {more} -o {folder}"
+        names = ", ".join(result.undecided)
+        printing.status(
+            f"{names} not decided: {again if folder else f'learn again with --passes {more}'}"
         )
-        return 0
-    if warnings is None:
-        printing.line(f"report written to {page}")
     return 0
 
 
