@@ -129,3 +129,22 @@ def test_a_run_and_a_recording_do_not_share_a_folder(
     (tmp_path / "letter.txt").write_text("mine")
     assert_one_line(cdmisfa(*record, tmp_path, "--resume"), 2, "has no recording to resume")
     assert names(tmp_path) == {"letter.txt"}
+
+
+@pytest.mark.parametrize(
+    ("words", "leftover"),
+    [
+        ("record oscillatory --frames 20", "recording.json.4711.partial"),
+        ("learn oscillatory --max-iterations 2 --no-rerun", "run.mcap.partial"),
+    ],
+)
+def test_a_command_that_was_killed_before_its_first_byte_is_repeated(
+    cdmisfa: Cdmisfa, tmp_path: Path, words: str, leftover: str
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / leftover).touch()
+    assert cdmisfa(*words.split(), "-o", out).code == 0
+    assert not list(out.glob("*.partial"))
+    done = cdmisfa(*words.split(), "-o", out)
+    assert (done.code, "exists" in done.err) == (2, True)

@@ -29,6 +29,7 @@ RECORDING: Final = "recording.json"
 _FILE_ENDINGS = frozenset({".csv", ".json", ".mcap", ".mp4", ".npz", ".parquet", ".png", ".rrd"})
 _LOG = re.compile(r"(?P<name>.+)\.mcap(\.partial(\.kept)?)?")
 _PART = re.compile(r"-\d{3,}$")
+_TEMPORARY = re.compile(r".+\.\d+\.partial")
 
 
 # Checks of output names; each raises a UsageError
@@ -84,9 +85,15 @@ def refuse_existing(folder: Path, *, force: bool, resumable: bool = True) -> Non
     """
     refuse_file(folder)
     refuse_named_as_file(folder)
-    if folder.exists() and not force and any(folder.iterdir()):
+    if folder.exists() and not force and not all(map(_is_leftover, folder.iterdir())):
         resume = ", continue with --resume," if resumable else ""
         raise UsageError(f"{folder} exists: choose another folder{resume} or add --force")
+
+
+def _is_leftover(path: Path) -> bool:
+    """Return whether a killed process left a file without content, or one of `atomic_write`."""
+    empty = _LOG.fullmatch(path.name) and path.is_file() and not path.stat().st_size
+    return bool(empty or _TEMPORARY.fullmatch(path.name))
 
 
 def local_folder(place: str | Path) -> Path:
