@@ -28,7 +28,7 @@ CEILINGS = {
     "recorder/log": 1320,
     "recorder/mcap": 1570,
     "recorder/world": 1410,
-    "replay": 730,
+    "replay": 740,
     "replay/corpus": 820,
     "replay/export": 740,
     "replay/integrity": 950,
