@@ -192,20 +192,33 @@ class Stack:
 
     def __init__(self, modules: Sequence[Module]) -> None:
         self.modules = tuple(modules)
-        weights = [np.ascontiguousarray(m.phi, np.float64) for m in modules]
-        self._phi = np.concatenate(weights)
-        means = [kernels.mean_output(p, m._mean) for p, m in zip(weights, modules, strict=True)]
-        self._offset = np.concatenate(means)
+        by_shape: dict[tuple[int, ...], list[tuple[Module, slice]]] = {}
+        for module, columns in columns_of(modules):
+            by_shape.setdefault(module.frame_shape, []).append((module, columns))
+        self._parts: list[tuple[Module, NDArray[np.intp], Any, Any]] = []
+        for part in by_shape.values():
+            weights = [np.ascontiguousarray(m.phi, np.float64) for m, _ in part]
+            pairs = zip(weights, part, strict=True)
+            means = [kernels.mean_output(phi, module._mean) for phi, (module, _) in pairs]
+            places = np.concatenate([np.arange(c.start, c.stop) for _, c in part])
+            stacked = np.concatenate(weights), np.concatenate(means)
+            self._parts.append((part[0][0], places, *stacked))
 
     def transform(self, frames: Any) -> NDArray[np.float64]:
         """Return the outputs of all modules side by side, (n, R), equal to those of each module.
+
+        Of modules for frames of several shapes, those for another shape have NaN.
 
         Args:
             frames: see `Module.rows`; without the mean of their episode if the modules learned
                 from centred frames.
         """
-        rows = self.modules[0].rows(frames, centre=False)
-        return _projected(rows, self.modules[0].expansion, self._phi, self._offset)
+        y = np.full((len(frames), sum(len(places) for _, places, _, _ in self._parts)), np.nan)
+        for module, places, phi, offset in self._parts:
+            if len(self._parts) == 1 or np.shape(frames)[1:] == module.frame_shape:
+                rows = module.rows(frames, centre=False)
+                y[:, places] = _projected(rows, module.expansion, phi, offset)
+        return y
 
 
 def _projected(

@@ -214,10 +214,11 @@ class ViewLogs:
     def write(self, block: Block) -> None:
         """Write a block; raise an error if it contradicts the specification of its source."""
         shape, dtype, spec = block.frames.shape[1:], block.frames.dtype, self._recording.spec
-        if shape != spec.frame_shape or dtype != spec.dtype:
+        stated = spec.kind(block.stream)
+        if (shape, str(dtype)) != stated:
             raise CdmisfaError(
                 f"frame {block.t} of {spec.streams[block.stream]} is {shape} {dtype}, but its "
-                f"source states {spec.frame_shape} {spec.dtype}: correct the source"
+                f"source states {stated[0]} {stated[1]}: correct the source"
             )
         self._logs[block.stream].write(block)
 
@@ -290,11 +291,12 @@ def recording_spec(
     for name in spec.streams:
         if not _FILE_NAME.fullmatch(name) or spec.streams.count(name) > 1:
             raise UsageError(f"a view cannot be called {name!r}: use distinct file names")
-    if not spec.images and (spec.dtype, len(spec.frame_shape)) != ("float64", 1):
-        raise UsageError(
-            f"frames of the source are {spec.frame_shape} {spec.dtype}: a recording holds gray "
-            "images, (height, width) uint8, or vectors, (n,) float64"
-        )
+    for shape, dtype in spec.every_kind:
+        if (dtype, len(shape)) not in (("uint8", 2), ("float64", 1)):
+            raise UsageError(
+                f"frames of the source are {shape} {dtype}: a recording holds gray images, "
+                "(height, width) uint8, or vectors, (n,) float64"
+            )
     slowest, fastest = RECORDED_FPS
     if not slowest <= spec.fps <= fastest:
         raise UsageError(

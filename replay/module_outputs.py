@@ -98,7 +98,7 @@ class ModuleOutputs:
     """
 
     def __init__(self, module: Module, spec: SourceSpec) -> None:
-        self.module, self.count, self._shape = module, 0, spec.frame_shape
+        self.module, self.count, self._shape = module, 0, spec.kind(module.stream_index)[0]
         self._sum, self._squares = np.zeros(prod(self._shape)), np.zeros(prod(self._shape))
         self._low: list[SampledFrame] = []
         self._high: list[SampledFrame] = []

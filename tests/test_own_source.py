@@ -63,7 +63,10 @@ def test_an_own_source_has_gaps_where_an_array_is_missing(tmp_path: Path) -> Non
         ([{"a": 1.0}, {"b": 1.0}], "frame 1 is of a stream b, which the first step does not name"),
         ([np.zeros(3), np.ones(3, complex)], "frame 1 of stream is complex128"),
         ([np.array(["x"])], "frame 0 of stream is <U1"),
-        ([{"a": np.zeros(3), "b": np.zeros((4, 4))}], r"frame 0 of b is float64 \(4, 4\)"),
+        (
+            [{"a": np.zeros(3), "b": np.zeros((4, 4))}, {"b": np.zeros(4)}],
+            r"frame 1 of b is float64 \(4,\)",
+        ),
         ([np.zeros((4, 4)), np.full((4, 4), 9.0)], "frame 1 of stream is .* floats of 0 to 1"),
         ([np.ma.array([1, 2], mask=[0, 1])], "stream: some values are masked"),
         ([scipy.sparse.eye(3).tocsr()], "stream: the array is sparse: give it as x.toarray()"),

@@ -112,7 +112,6 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
         (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
         (["one", 2], "shape .* of <U21 is not supported: use"),
         (np.zeros((0, 3)), "shape .0, 3. of float64 is not supported: use"),
-        ({"a": numbers(), "b": pictures(4, 5)}, "the streams have 3 numbers and images"),
         ("nowhere.npz", "no such file"),
         (numbers()[:10], "10 frames are left at frame 0, but a block has 40"),
     ],

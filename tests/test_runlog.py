@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -118,7 +117,8 @@ def test_a_header_or_a_version_that_cannot_be_is_damage(tmp_path, monkeypatch, k
         if key is None:
             patch.setattr("replay.runs.writer.SCHEMA_VERSION", value)
         else:
-            patch.setattr("replay.runs.writer.asdict", lambda spec: asdict(spec) | {key: value})
+            stated = VECTOR.as_json() | {key: value}
+            patch.setattr(SourceSpec, "as_json", lambda spec: stated)
         write_run(path, VECTOR, 2)
     with pytest.raises(LogDamagedError, match=f"metadata cdmisfa.run is broken.*{words}"):
         list(read_signals(path))

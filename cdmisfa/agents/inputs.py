@@ -25,13 +25,13 @@ LARGEST_VALUE = 1e100
 MAX_INPUTS = 2_000_000
 
 
-def count_inputs(expansion: str, spec: SourceSpec) -> int:
-    """Return the number of inputs after expansion.
+def count_inputs(expansion: str, shape: tuple[int, ...]) -> int:
+    """Return the number of inputs after expansion of frames of a shape.
 
     Raises:
         UsageError: the expansion does not exist, or it makes more than `MAX_INPUTS` inputs.
     """
-    values = math.prod(spec.frame_shape)
+    values = math.prod(shape)
     inputs = expanded_size(expansion, values)
     if inputs > MAX_INPUTS:
         fact = f"learner.expansion {expansion} makes {inputs:,} inputs of {values:,} values"
@@ -54,11 +54,11 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
     """
     frames = block.frames
     actual = len(frames), block.stream, frames.shape[1:], frames.dtype
-    expected = tau, stream, spec.frame_shape, np.dtype(spec.dtype)
+    shape, dtype = spec.kind(stream)
+    expected = tau, stream, shape, np.dtype(dtype)
     if actual != expected:
         texts = (
-            f"{n} frames of stream {s}, {shape} {dtype}"
-            for n, s, shape, dtype in (expected, actual)
+            f"{n} frames of stream {s}, {form} {kind}" for n, s, form, kind in (expected, actual)
         )
         raise ValueError(f"the learner asked for {', not '.join(texts)}")
     if frames.dtype.kind == "f" and not (  # also true of NaN; without an array as large as frames

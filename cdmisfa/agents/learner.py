@@ -71,7 +71,12 @@ class CuriousLearner:
         self.config, self.spec, self.seed = config, spec, seed
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
-        self._n_inputs = inputs = count_inputs(config.expansion, spec)
+        if spec.kinds:
+            raise UsageError(
+                f"{' and '.join(spec.streams)} have frames of different kinds, but learner "
+                f"{config.algorithm} takes one kind: add --algorithm progress"
+            )
+        self._n_inputs = inputs = count_inputs(config.expansion, spec.frame_shape)
         if config.components > inputs:
             limit = f"more than the {inputs} inputs: set it to at most {inputs}"
             raise UsageError(f"learner.components is {config.components}, {limit}")

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import contextlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -23,6 +22,9 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 UINT8 = np.dtype(np.uint8)
 PIXEL = 1.0 / 255.0
 
+# Shape of a frame, and its element type.
+FrameKind = tuple[tuple[int, ...], str]
+
 
 @dataclass(frozen=True, slots=True)
 class Block:
@@ -31,7 +33,7 @@ class Block:
     Attributes:
         stream: index of the stream, from 0.
         t: global frame counter of the first frame.
-        frames: (n, *frame_shape), uint8 pixels or float64 values; C-contiguous,
+        frames: (n, *shape) of the stream's kind, uint8 pixels or float64 values; C-contiguous,
             read-only, and never written again by the source.
         truth: (n, D) float64 true state of the world, which the learner does not see: one column
             for each name in `SourceSpec.truth`. D may be 0.
@@ -52,12 +54,13 @@ class SourceSpec:
 
     Attributes:
         streams: name of each stream (of the view in a recording).
-        frame_shape: (height, width) of an image, (I,) of a vector.
-        dtype: "uint8" for pixels, "float64" for values.
+        frame_shape: (height, width) of an image, (I,) of a vector; () if `kinds` differ.
+        dtype: "uint8" for pixels, "float64" for values; "mixed" if `kinds` differ.
         truth: name of each column of `Block.truth`.
         fps: frames per second of the common clock.
         start_ns: log time of frame 0 (ns).
         length: number of frames, or None if the source is endless.
+        kinds: shape and type of the frames of each stream, only if they differ; see `of_kinds`.
 
     Raises:
         UsageError: `fps` is outside of 1e-6 to 1e9.
@@ -70,6 +73,14 @@ class SourceSpec:
     fps: float = 50.0
     start_ns: int = 0
     length: int | None = None
+    kinds: tuple[FrameKind, ...] = ()
+
+    @classmethod
+    def of_kinds(cls, streams: Sequence[str], kinds: Sequence[FrameKind], *about: Any) -> Self:
+        """Return the spec of streams with frames of some kinds; `about` is `truth` to `length`."""
+        if len(set(kinds)) == 1:
+            return cls(tuple(streams), *kinds[0], *about)
+        return replace(cls(tuple(streams), (), "mixed", *about), kinds=tuple(kinds))
 
     def __post_init__(self) -> None:
         if not SLOWEST <= self.fps <= NANOSECONDS:
@@ -77,8 +88,33 @@ class SourceSpec:
 
     @property
     def images(self) -> bool:
-        """Whether frames are gray images."""
+        """Whether the frames of every stream are gray images, all of one shape."""
         return self.dtype == "uint8" and len(self.frame_shape) == 2
+
+    def kind(self, stream: int) -> FrameKind:
+        """Return shape and type of the frames of a stream."""
+        return self.kinds[stream] if self.kinds else (self.frame_shape, self.dtype)
+
+    @property
+    def every_kind(self) -> list[FrameKind]:
+        """Shapes and types of the frames of all streams, each once."""
+        return list(dict.fromkeys(self.kinds)) or [self.kind(0)]
+
+    def of(self, stream: int) -> SourceSpec:
+        """Return the spec of one stream alone."""
+        shape, dtype = self.kind(stream)
+        name = (self.streams[stream],)
+        return replace(self, streams=name, frame_shape=shape, dtype=dtype, kinds=())
+
+    @property
+    def size(self) -> list[Any]:
+        """Shape of a frame as JSON values, a list for each stream if they differ."""
+        return [list(shape) for shape, _ in self.kinds] or list(self.frame_shape)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the attributes as JSON values, `kinds` only if they differ."""
+        stated = asdict(self)
+        return stated if self.kinds else {k: v for k, v in stated.items() if k != "kinds"}
 
     def time_ns(self, t: int) -> int:
         """Return the log time of frame t (ns)."""
@@ -97,7 +133,7 @@ class SourceSpec:
         return {
             "streams": ", ".join(self.streams),
             "frames": "without end" if self.length is None else self.length,
-            "shape": "x".join(map(str, self.frame_shape)),
+            "shape": ", ".join("x".join(map(str, shape)) for shape, _ in self.every_kind),
             "rate": f"{self.fps:g} Hz",
         }
 
@@ -250,7 +286,7 @@ class ForwardSource(Described, FrameSource):
                     run, count = [], 0
                 run.append(block)
                 count += len(block)
-        return _join(run)
+        return join_blocks(run)
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
@@ -284,11 +320,6 @@ def turn_to(source: FrameSource, before: int, after: int) -> None:
     A source whose head has to turn has the attribute `turns`: turns[from][to] is the number of lost
     frames. It depends on the two streams only, so that a recording gives the same blocks as the
     scene.
-
-    Args:
-        source: the source.
-        before: index of the stream of the last block.
-        after: index of the stream of the next block.
     """
     turns = getattr(source, "turns", ())
     if turns and isinstance(source, SeekableSource):
@@ -342,42 +373,7 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
         raise ValueError(f"a block has at least one frame, not {n}")
 
 
-def stretches(
-    rows: Sequence[Sequence[Any]], t: int, truth: NDArray[np.float64]
-) -> tuple[Block, ...]:
-    """Return the blocks of consecutive frames of all streams, one for each stretch without a gap.
-
-    Args:
-        rows: frame of each stream at each step, None for a missing one.
-        t: number of the first step.
-        truth: (n, D) truth of the steps, read-only.
-    """
-    blocks: list[Block] = []
-    for stream, column in enumerate(zip(*rows, strict=True)):
-        for is_gap, stretch in groupby(enumerate(column), lambda step: step[1] is None):
-            if not is_gap:
-                steps, frames = zip(*stretch, strict=True)
-                part = truth[steps[0] : steps[-1] + 1]
-                blocks.append(Block(stream, t + steps[0], freeze(np.stack(frames)), part))
-    return tuple(blocks)
-
-
-def unbroken(blocks: Iterable[Block]) -> list[Block]:
-    """Return the stretches without a gap of streams that were read in pieces.
-
-    Args:
-        blocks: pieces, those of each stream in order of time.
-    """
-    by_stream: dict[int, list[list[Block]]] = {}
-    for block in blocks:
-        runs = by_stream.setdefault(block.stream, [[]])
-        if runs[-1] and runs[-1][-1].t + len(runs[-1][-1]) != block.t:
-            runs.append([])
-        runs[-1].append(block)
-    return [_join(run) for runs in by_stream.values() for run in runs]
-
-
-def _join(run: Sequence[Block]) -> Block:
+def join_blocks(run: Sequence[Block]) -> Block:
     """Return consecutive blocks of a stream as one block."""
     if len(run) == 1:
         return run[0]

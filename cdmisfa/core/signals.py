@@ -108,7 +108,8 @@ class BlockSignals:
         share: Recent share of blocks that were novel and of the same stream as the block before.
         novel_blocks: Number of novel blocks since the last module was saved.
         y: Output of the features being learned, on the block.
-        y_frozen: Output of each saved module on the block.
+        y_frozen: Output of each saved module on the block; NaN for modules that learned from frames
+            of another shape or type, which the block cannot have.
         eta: Slowness of each output.
         eta_dot: Running mean of the change of slowness; a module is saved when it is below δ.
         variance: Recent variance of each output.

@@ -23,8 +23,9 @@ from cdmisfa.agents.progress import decisions
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.learner import MIN_TEST_BLOCKS
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, unbroken
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.gaps import unbroken
 from cdmisfa.core.names import kind_of_frames
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
@@ -84,7 +85,11 @@ class Application:
         test_frames = int(learner.get("test_frames", ProgressConfig().test_frames))
         self._window = max(test_frames, MIN_TEST_BLOCKS * self.tau)
         self._stack = Stack(self.modules)
-        self.recipe = self.modules[0].recipe or Recipe(run.header.spec.frame_shape)
+        recipes = [module.recipe or Recipe(module.frame_shape) for module in self.modules]
+        self.recipe, self._recipes = recipes[0], recipes
+        self._shapes = list(dict.fromkeys(recipe.shape for recipe in recipes))
+        topics = run.header.manifest["source"].get("topics", ())
+        self._topics = tuple(topics) if run.header.spec.kinds else ()
         self._folder = run.log.parent
 
     @functools.cached_property
@@ -127,28 +132,32 @@ class Application:
             source = configure(words[0], inputs=inputs).open_scene()
         else:
             source = self._open_log(words, inputs, loop=loop, skip_damaged=skip_damaged)
-        if source.spec.frame_shape != self.recipe.shape:
+        shapes = [shape for shape, _ in source.spec.every_kind]
+        if not set(shapes) & set(self._shapes):
             source.close()
+            here, learned = (" and ".join(map(kind_of_frames, s)) for s in (shapes, self._shapes))
             raise UsageError(
-                f"{words[0]} has {kind_of_frames(source.spec.frame_shape)}, but the run learned "
-                f"from {kind_of_frames(self.recipe.shape)}: name a log with such frames, or choose "
-                "streams with --topic or numbers with --field"
+                f"{words[0]} has {here}, but the run learned from {learned}: name a log with such "
+                "frames, or choose streams with --topic or numbers with --field"
             )
         return centre_as(self.recipe.centre, source, words[0])
 
     def _with_recipe(self, inputs: InputOptions) -> InputOptions:
-        recipe, numbers_range = self.recipe, inputs.range or self.recipe.range
-        if recipe.size is None:
-            return replace(inputs, fields=inputs.fields or recipe.fields, range=numbers_range)
-        framing: Any = {"size": recipe.size, "fit": recipe.fit, "color": recipe.color}
-        return replace(inputs, **framing, range=numbers_range)
+        framing: Any = {"range": inputs.range or self.recipe.range}
+        framing["topics"] = inputs.topics or self._topics
+        for recipe in self._recipes:
+            if recipe.size is None:
+                framing["fields"] = inputs.fields or recipe.fields
+            else:
+                framing |= {"size": recipe.size, "fit": recipe.fit, "color": recipe.color}
+        return replace(inputs, **framing)
 
     def _open_log(self, words: Sequence[str], inputs: InputOptions, **options: Any) -> FrameSource:
         places = locations(words)
         if not inputs.external and not any(map(is_external_format, places)):
             with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
                 recorded = open_recording(places, **options)
-                if recorded.spec.frame_shape == self.recipe.shape or not recorded.spec.images:
+                if recorded.spec.frame_shape in self._shapes or not recorded.spec.images:
                     return recorded
                 recorded.close()
         return with_every_topic(
@@ -189,9 +198,10 @@ class Application:
 
     def _step(self, spec: SourceSpec) -> int:
         """Return the number of frames of a log to read at once, a multiple of tau."""
-        pixels = math.prod(spec.frame_shape) * np.dtype(spec.dtype).itemsize
+        kinds = map(spec.kind, range(len(spec.streams)))
+        pixels = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in kinds)
         outputs = sum(len(module.phi) for module in self.modules)
-        frame_bytes = len(spec.streams) * (pixels + 8 * outputs)
+        frame_bytes = pixels + 8 * len(spec.streams) * outputs
         return max(READ_BYTES // frame_bytes // self.tau, 1) * self.tau
 
     def _ahead(self, reads: Iterator[Sequence[Block]]) -> Iterator[list[Part]]:
@@ -367,6 +377,7 @@ class Totals:
                 sums.T.tolist(),
                 strict=True,
             )
+            if module.frame_shape in ((), self._spec.kind(stream)[0])
         ]
 
 

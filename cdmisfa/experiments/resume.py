@@ -34,7 +34,7 @@ from replay.runs.provenance import changed_files, stated_source
 from replay.stored_source import StoredSource
 
 # Properties of a source that must equal those of the source that the run learned from.
-SPEC_FIELDS = ("streams", "frame_shape", "dtype", "fps", "start_ns")
+SPEC_FIELDS = ("streams", "frame_shape", "dtype", "kinds", "fps", "start_ns")
 
 # Keys that a fork must not change, because the meaning of the learner's arrays depends on them.
 FIXED = ("learner.algorithm", "learner.expansion", "learner.tau")
@@ -97,9 +97,11 @@ def fork_span(
 
 
 def restore(learner: Learner, keyframe: Keyframe, spec: SourceSpec) -> None:
-    """Set a learner to the state of a keyframe; its modules get the frame shape of `spec`."""
+    """Set a learner to the state of a keyframe; its modules get the frame shapes of `spec`."""
     try:
-        modules = (replace(m, frame_shape=spec.frame_shape) for m in keyframe.state.modules)
+        modules = (
+            replace(m, frame_shape=spec.kind(m.stream_index)[0]) for m in keyframe.state.modules
+        )
         learner.restore(replace(keyframe.state, modules=tuple(modules)))
     except (LookupError, TypeError, ValueError) as error:
         raise LogDamagedError(

@@ -247,7 +247,7 @@ def with_recipes(
         described = source.origin()
 
     def recipe(stream: int) -> Recipe:
-        result = Recipe.of(described, source.spec.frame_shape, stream)
+        result = Recipe.of(described, source.spec.kind(stream)[0], stream)
         frames = () if "size" in described else result.size  # else the raw images are frames
         framings = getattr(source, "framings", [None] * len(source.spec.streams))
         result = replace(result, raw=getattr(framings[stream], "first", frames) or ())

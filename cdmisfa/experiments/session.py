@@ -7,7 +7,6 @@ and result, RUN/run.rrd with the view. `loop` has the loop, `run_folder` the fol
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -142,7 +141,7 @@ class Session:
             self.manifest[FORK] = header.manifest[FORK]
         as_json = json.loads(json.dumps(self.manifest))  # lists instead of tuples, as in the log
         source_then, source_now = comparable(stated_source(log), as_json["source"])
-        spec_then, spec_now = map(dataclasses.asdict, (header.spec, self.source.spec))
+        spec_then, spec_now = (spec.as_json() for spec in (header.spec, source.spec))
         then = {**header.manifest, "source": source_then, "spec": spec_then, COMMAND: None}
         now = {**as_json, "source": source_now, "spec": spec_now, COMMAND: None}
         changed = {

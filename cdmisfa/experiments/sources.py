@@ -169,6 +169,8 @@ def configure_for(
     misplaced += [f"record.{key}" for key in settings.words.get("record", {}) if key in CLOCK]
     if misplaced and not resumed:
         raise UsageError(f"{are_for(misplaced, 'live scenes')}, and this source is not one")
+    if inputs is not None and inputs.fields and spec.images:
+        raise UsageError(f"{', '.join(spec.streams)} has no numbers: leave out --field")
     scene = str(described.get("scene", ""))
     kind = scene if scene in SCENES else str(settings.section("scene")[0].get("kind"))
     if kind not in SCENES:

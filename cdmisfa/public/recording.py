@@ -120,7 +120,8 @@ class Recording(Described):
         stop = length if stop is None else stop
         if stop is None or not 0 <= start <= stop or (length is not None and stop > length):
             raise ValueError(f"no frames [{start}, {stop}): there are [0, {length or '...'})")
-        parts = [np.empty((0, *self.spec.frame_shape), self.spec.dtype)]
+        shape, dtype = self.spec.kind(index)
+        parts = [np.empty((0, *shape), dtype)]
         with self.source() as source:
             first = getattr(source, "first_frame", 0)
             spans = source.spans(index, first + start, first + stop) if stop > start else []

@@ -13,9 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze, stretches
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.gaps import stretches
 from recorder.cameras.readers import CameraState, Readers, Stamped
 from recorder.images.pixels import Content
 
@@ -124,8 +125,8 @@ class LiveSource(ForwardSource):
     with the first stream that ends.
 
     Args:
-        readers: readers of the cameras, whose images have one size; they are closed with the
-            source.
+        readers: readers of the cameras, whose images have one size, and of numbers; they are
+            closed with the source.
         names: names of the streams.
         about: identity of the cameras.
         rate: ticks a second; None: rate of the first camera, stated or measured.
@@ -165,9 +166,9 @@ class LiveSource(ForwardSource):
             raise
         # Half a tick later, so that a camera with the rate of the clock can jitter by as much.
         start = max(images[0].time_ns for images in firsts) + round(NANOSECONDS / fps / 2)
-        image = firsts[0][0].image
-        self._spec = SourceSpec(tuple(names), image.shape, str(image.dtype), (), fps, start)
-        self._about = {**about, "size": list(image.shape), "rate": fps, "hold": hold}
+        kinds = [(images[0].image.shape, str(images[0].image.dtype)) for images in firsts]
+        self._spec = SourceSpec.of_kinds(names, kinds, (), fps, start)
+        self._about = {**about, "size": self._spec.size, "rate": fps, "hold": hold}
         for stream, images in zip(self._streams, firsts, strict=True):
             before = sum(stamped.time_ns <= start for stamped in images)
             for stamped in images[max(before - 1, 0) :]:

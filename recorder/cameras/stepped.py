@@ -12,12 +12,21 @@ from itertools import chain, count, islice
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray, FloatArray, as_array, without_table
-from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze, stretches
+from cdmisfa.core.blocks import (
+    Block,
+    ForwardSource,
+    FrameKind,
+    SourceSpec,
+    check_request,
+    freeze,
+)
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
+from cdmisfa.core.gaps import stretches
 from cdmisfa.core.names import ACTION, BEGINS
 from recorder.images.framing import Recipe, default_size, framings, make_frame, size_of
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
@@ -97,18 +106,18 @@ class ArraySource(SteppedSource):
             given = (dict(zip(streams, row, strict=True)) for row in rows)
         steps = (step if isinstance(step, Mapping) else {"stream": step} for step in given)
         first = next(steps, {})
-        frames = [np.atleast_1d(as_array(f, str(n))) for n, f in first.items() if f is not None]
-        if not frames:
+        frames = [None if f is None else np.atleast_1d(as_array(f, n)) for n, f in first.items()]
+        kinds = [_kind(frame, size) for frame in frames if frame is not None]
+        if not kinds:
             raise UsageError(
                 'the first step has no frame: yield an array or {"left": array, ...} for each time '
                 "step"
             )
-        shape = frames[0].shape
-        if len(shape) > 1:
-            shape = size or default_size(size_of(frames[0]))
+        frame_size = next((shape for shape, dtype in kinds if dtype == "uint8"), None)
+        kinds = [kinds[0] if frame is None else _kind(frame, frame_size) for frame in frames]
         rate = getattr(streams, "fps", 50.0) if fps is None else fps
-        dtype = "uint8" if len(shape) > 1 else "float64"
-        spec = SourceSpec(tuple(map(str, first)), shape, dtype, (), rate, start_ns, length)
+        names = [*map(str, first)]
+        spec = SourceSpec.of_kinds(names, kinds, (), rate, start_ns, length)
         self.gaps = length is None
         framed = _framed(spec, tuple(first), chain([first], steps))
         super().__init__(spec, chain([next(framed)], framed))  # checks the first frames at once
@@ -118,11 +127,18 @@ class ArraySource(SteppedSource):
         return {"kind": "arrays", "streams": list(self._spec.streams)}
 
 
+def _kind(frame: NDArray[Any], size: Any) -> FrameKind:
+    """Return shape and type of the frames of a stream with this first image or numbers."""
+    if frame.ndim < 2:
+        return frame.shape, "float64"
+    return size or default_size(size_of(frame)), "uint8"
+
+
 def _framed(
     spec: SourceSpec, names: Sequence[Any], steps: Iterable[Mapping[Any, Any]]
 ) -> Iterator[Step]:
-    """Convert the frames of all streams to the shape and type of the first, and yield them."""
-    recipe = Recipe(spec.frame_shape)
+    """Convert the frames of each stream to their shape and type, and yield them."""
+    recipes = [Recipe(spec.kind(stream)[0]) for stream in range(len(names))]
     for t, step in enumerate(steps):
         if unknown := [name for name in step if name not in names]:
             raise UsageError(
@@ -130,15 +146,15 @@ def _framed(
                 f"None for {unknown[0]} there"
             )
         row: list[Any] = []
-        for name in names:
+        for name, recipe in zip(names, recipes, strict=True):
             frame = step.get(name)
             if frame is not None:
                 array = np.atleast_1d(as_array(frame, f"frame {t} of {name}"))
                 about = f"frame {t} of {name} is {array.dtype} {array.shape}"
-                numbers = array.dtype.kind in "biuf" and array.shape == spec.frame_shape
-                if not spec.images and not numbers:
-                    raise UsageError(f"{about}: give numbers {spec.frame_shape}, as the first")
-                if not spec.images and not np.isfinite(array).all():
+                numbers = array.dtype.kind in "biuf" and array.shape == recipe.shape
+                if recipe.size is None and not numbers:
+                    raise UsageError(f"{about}: give numbers {recipe.shape}, as the first")
+                if recipe.size is None and not np.isfinite(array).all():
                     raise UsageError(
                         f"frame {t} of {name} has NaN or infinity: fill it in, or give None for a "
                         "missing frame"

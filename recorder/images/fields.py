@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +28,25 @@ _Step = str | int | slice
 def is_path(text: str) -> bool:
     """Return whether a text can be a path to numbers in a message."""
     return _PATH.fullmatch(text) is not None
+
+
+# Field that means every number of a message.
+EVERY: Final = ("*",)
+
+# Members of messages that are times, and not read as numbers unless they are named.
+_TIMES: Final = ("header", "time", "timestamp", "stamp")
+
+
+def number_paths(message: Any, above: str = "") -> Iterator[str]:
+    """Yield the paths to all numbers in a message except its time."""
+    for name in members(message):
+        member = field_value(message, name)
+        while _is_list(member) and len(member):
+            member = member[0]
+        if members(member) and name not in _TIMES:
+            yield from number_paths(member, f"{above}{name}.")
+        elif isinstance(member, bool | int | float | np.generic) and name not in _TIMES:
+            yield above + name
 
 
 class Field:
@@ -167,6 +186,6 @@ def field_value(value: Any, name: str) -> Any:
 
 
 def _is_list(value: Any) -> bool:
-    if isinstance(value, str | bytes | Mapping):
+    if isinstance(value, str | bytes | Mapping | np.generic):
         return False
     return isinstance(value, np.ndarray) or hasattr(value, "__getitem__")

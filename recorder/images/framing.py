@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.blocks import FrameKind
 from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import counted
@@ -82,6 +83,11 @@ class Framing:
         return (*self.size[:-1], self.size[-1] * (3 if self.color else 1))
 
     @property
+    def kind(self) -> FrameKind:
+        """Shape and type of a frame."""
+        return self.shape, "uint8" if self.first else "float64"
+
+    @property
     def lossy(self) -> str:
         """Description of how images of another aspect ratio are fitted; "" for the same ratio."""
         if not self.first:
@@ -105,7 +111,7 @@ class Framing:
 def framings(
     firsts: Sequence[Content], size: Size | None, fit: Fit, *, color: bool = False
 ) -> Sequence[Framing]:
-    """Choose how the images or numbers of streams become frames of one shape.
+    """Choose how images become frames of one shape, and numbers frames as they are.
 
     Args:
         firsts: first image or numbers of each stream.
@@ -114,22 +120,20 @@ def framings(
         color: True to show the red, green and blue images side by side.
 
     Raises:
-        UsageError: streams have both images and numbers, or different counts of numbers.
+        UsageError: an option for images is set, and no stream has images.
     """
-    if all(first.ndim > 1 for first in firsts):
-        size = size or default_size(size_of(firsts[0]))
-        return [Framing(size_of(first), size, fit, color) for first in firsts]
-    kinds = ["images" if first.ndim > 1 else counted(len(first), "number") for first in firsts]
-    if len(set(kinds)) > 1:
-        raise UsageError(
-            f"the streams have {' and '.join(dict.fromkeys(kinds))}, but frames must have one "
-            "shape: take equally many numbers of each, as with --field position[0:6], or learn "
-            "from each stream alone"
-        )
+    images = [first for first in firsts if first.ndim > 1]
     image_options = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
-    if refused := [option for option, chosen in image_options.items() if chosen]:
+    refused = [option for option, chosen in image_options.items() if chosen]
+    if refused and not images:
         raise UsageError(f"the frames are numbers: {are_for(refused, 'images')}")
-    return [Framing((), first.shape) for first in firsts]
+    size = size or (default_size(size_of(images[0])) if images else None)
+    return [
+        Framing((), first.shape)
+        if size is None or first.ndim < 2
+        else Framing(size_of(first), size, fit, color)
+        for first in firsts
+    ]
 
 
 def size_of(image: Content) -> Size:

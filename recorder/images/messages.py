@@ -10,6 +10,7 @@ import base64
 import re
 import struct
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Final, NamedTuple
 
@@ -25,7 +26,14 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.compressed import compressed_image, compressed_words
-from recorder.images.fields import Field, field_value, members, numbers_of
+from recorder.images.fields import (
+    EVERY,
+    Field,
+    field_value,
+    members,
+    number_paths,
+    numbers_of,
+)
 from recorder.images.options import Depth, InputOptions
 from recorder.images.pixels import DISTANCES, Content, MalformedImage, raw_image
 from recorder.images.videos import Packet, VideoPackets
@@ -256,14 +264,35 @@ def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:
         decode = message_decoder(kind)
         if decode is None:
             return None
-        fields = [Field(path) for path in options.fields]
-        return lambda data: numbers_of(fields, decode(bytes(data)), depth)
+        every = options.fields == EVERY
+        fields = [] if every else [Field(path) for path in options.fields]
+
+        def numbers(data: Data) -> Content:
+            message = decode(bytes(data))
+            fields.extend(map(Field, () if fields else number_paths(message)))
+            return numbers_of(fields, message, depth)
+
+        return numbers
     content = _CONTENT.get(kind[:2])
     if content is None:
         return None
     if kind[:2] in _VIDEOS:
         return VideoPackets(content, color=color)
     return lambda data: content(data).image(depth, color=color)
+
+
+def options_for(topic: str, kind: MessageKind, options: InputOptions) -> InputOptions:
+    """Return the options for a topic: of chosen ones, those without images are read as numbers."""
+    if not options.topics or (kind[:2] not in _CONTENT and topic not in options.topics):
+        return options
+    fields = () if kind[:2] in _CONTENT else options.fields or EVERY
+    return replace(options, fields=fields)
+
+
+def every_field(kind: MessageKind, data: Data) -> tuple[str, ...]:
+    """Return the fields with numbers of a message; () if its kind is unknown."""
+    decode = message_decoder(kind)
+    return () if decode is None else tuple(number_paths(decode(bytes(data))))
 
 
 def stated_format(schema: str, encoding: str, data: Data) -> str:

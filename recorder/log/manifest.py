@@ -258,13 +258,15 @@ class RecordingSpec:
     def metadata(self, view: str, first_frame: int = 0) -> ViewMetadata:
         """Return the metadata of a view's file that begins with a frame."""
         spec, named = self.spec, len(self.spec.streams) <= MAX_NAMED
+        stream = spec.streams.index(view)
+        shape, dtype = spec.kind(stream)
         return ViewMetadata(
             scene=self.kind,
             view=view,
-            stream_index=spec.streams.index(view),
+            stream_index=stream,
             streams=spec.streams if named else (),
-            frame_shape=spec.frame_shape,
-            dtype=spec.dtype,
+            frame_shape=shape,
+            dtype=dtype,
             truth=spec.truth,
             fps=float(spec.fps),
             start_ns=spec.start_ns,

@@ -182,7 +182,7 @@ class ViewLog:
 
 def _encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Encoder]:
     """Return the encoders of a view by topic: frames, truth, and the world of its scene if any."""
-    spec = recording.spec
+    spec = recording.spec.of(recording.spec.streams.index(view))
     encoders: dict[str, Encoder] = {view_topic(view): VectorEncoder()}
     if spec.images:
         height, width = spec.frame_shape

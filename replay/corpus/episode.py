@@ -160,5 +160,5 @@ def episode_of(
 
 def are_alike(spec: SourceSpec, first: SourceSpec) -> bool:
     """Return whether logs can be episodes of one source."""
-    kinds = [(one.frame_shape, one.dtype, one.truth) for one in (spec, first)]
+    kinds = [(one.every_kind, one.truth, one.streams if one.kinds else ()) for one in (spec, first)]
     return kinds[0] == kinds[1] and abs(spec.fps / first.fps - 1) <= UNEVEN

@@ -303,7 +303,8 @@ class EpisodeSource(StoredSource):
 def _described(spec: SourceSpec) -> str:
     """Return kind, rate and ground truth of the frames of a log as text."""
     truth = f" with ground truth {', '.join(spec.truth)}" if spec.truth else ""
-    return f"{kind_of_frames(spec.frame_shape)} at {spec.fps:g} Hz{truth}"
+    frames = " and ".join(kind_of_frames(shape) for shape, _ in spec.every_kind)
+    return f"{frames} at {spec.fps:g} Hz{truth}"
 
 
 def _few(lines: Sequence[str]) -> Sequence[str]:

@@ -175,10 +175,11 @@ def _log_sink(
 
     The file is readable while it is written; an error leaves a readable NAME.partial.
     """
-    encoders: list[Any] = [VectorEncoder() for _ in spec.streams]
-    if spec.images:
-        height, width = spec.frame_shape
-        encoders = [ImageEncoder(height, width, name) for name in spec.streams]
+    shapes = [spec.kind(stream)[0] for stream in range(len(spec.streams))]
+    encoders: list[Any] = [
+        ImageEncoder(shape[0], shape[1], name) if len(shape) > 1 else VectorEncoder()
+        for shape, name in zip(shapes, spec.streams, strict=True)
+    ]
     log = LogFile(out, force=force, compression="lz4", aside=True)
 
     def channel(topic: str, schema: str, definition: bytes) -> int:

@@ -107,6 +107,8 @@ def _opened(
             first = first or spec
             if form != "lerobot" and not spec.images:
                 why = "has no images: its frames are numbers; use --to lerobot"
+                if spec.kinds:
+                    why = "has streams of numbers: use --to lerobot"
             elif single and len(spec.streams) > 1:
                 why = f"has {len(spec.streams)} streams: choose a folder instead of one .mp4 file"
             for name in ("streams", "frame_shape", "dtype", "truth", "fps"):

@@ -48,7 +48,8 @@ def pieces(
 
     This moves the clock of the source.
     """
-    frame = math.prod(source.spec.frame_shape) * np.dtype(source.spec.dtype).itemsize
+    shape, dtype = source.spec.kind(stream)
+    frame = math.prod(shape) * np.dtype(dtype).itemsize
     size = max(1, min(PIECE, PIECE_BYTES // max(1, frame)))
     for low, high in _spans(source, stream) if spans is None else spans:
         for t in range(low, high, size):
@@ -122,6 +123,7 @@ def write_video(
         CdmisfaError: the file cannot be written.
     """
     av, spec, count = pyav("writing videos"), source.spec, 0
+    shape, _ = spec.kind(stream)
     first = source.first_frame if spans is None else spans[0][0]
     comment = {
         "view": spec.streams[stream],
@@ -135,8 +137,8 @@ def write_video(
         with av.open(str(file), "w", format="mp4") as container:
             container.metadata["comment"] = json.dumps(comment)
             video = container.add_stream("libx264", rate=rate, options=options)
-            video.height, video.width = spec.frame_shape
-            video.pix_fmt = pixel_format(spec.frame_shape)
+            video.height, video.width = shape
+            video.pix_fmt = pixel_format(shape)
             video.max_b_frames = 0  # the file's order is the order of display
             video.codec_context.color_range = FULL_RANGE
             for t, image in _video_frames(av, source, stream, spans):
@@ -154,8 +156,8 @@ def _video_frames(
     av: Any, source: LoggedSource, stream: int, spans: Sequence[Span] | None
 ) -> Iterator[tuple[int, Any]]:
     """Yield the frames of a stream with their numbers, as PyAV's, in one buffer."""
-    height, width = source.spec.frame_shape
-    kind = pixel_format(source.spec.frame_shape)
+    height, width = size = source.spec.kind(stream)[0]
+    kind = pixel_format(size)
     shape = (3, height, width) if kind == "yuv444p" else (height * 3 // 2, width)
     planes = np.full(shape, 128, dtype=np.uint8)  # 128 is the chroma of gray
     luma = planes[0] if planes.ndim == 3 else planes[:height]

@@ -87,10 +87,11 @@ def write_dataset(
                 }
                 for i, (begin, end) in enumerate(itertools.pairwise(ends))
             ]
-            views = stream_names(source.spec.streams) if source.spec.images else []
-            for stream, view in enumerate(views):
+            for stream, view in enumerate(stream_names(source.spec.streams)):
+                if not source.spec.of(stream).images:
+                    continue
                 key = f"observation.images.{view}"
-                features[key] = _video_feature(source.spec.frame_shape, fps)
+                features[key] = _video_feature(source.spec.kind(stream)[0], fps)
                 file = _path(folder / "videos" / key, log, "mp4")
                 write_video(source, stream, file, lossless=lossless, spans=spans)
                 for row, span in zip(rows, spans, strict=True):
@@ -154,7 +155,9 @@ def _numbers(source: LoggedSource, spans: Sequence[Span]) -> Columns:
                 groups.setdefault(STATE if state else WORLD, []).append(i)
         for key, group in groups.items():
             columns[key] = truth[:, group], [spec.truth[i] for i in group]
-    for stream, name in enumerate(() if spec.images else stream_names(spec.streams)):
+    for stream, name in enumerate(stream_names(spec.streams)):
+        if spec.of(stream).images:
+            continue
         frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
         columns[f"observation.{name}"] = frames, [f"x{i + 1}" for i in range(frames.shape[1])]
     return {

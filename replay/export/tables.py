@@ -122,7 +122,7 @@ def _facts(signal: Signal) -> dict[str, str]:
 def _run_facts(header: RunHeader) -> dict[str, str]:
     return {
         "schema": str(SCHEMA_VERSION),
-        "spec": json.dumps(asdict(header.spec)),
+        "spec": json.dumps(header.spec.as_json()),
         "manifest": json.dumps(header.manifest),
     }
 

@@ -112,7 +112,9 @@ class LoggedSource(StoredSource):
         self.framings: Sequence[Framing | None] = [None] * len(self.streams)
         if self.recorded:
             names = tuple(stream.topic for stream in self.streams)
-            self._spec = replace(facts.spec, streams=names, length=length)
+            kinds = [stream.views[0].facts.spec.kind(0) for stream in self.streams]
+            about = facts.truth, facts.fps, facts.start_ns, length
+            self._spec = SourceSpec.of_kinds(names, kinds, *about)
         else:
             names = unique_stream_names(self.streams)
             self._images = images = Images(
@@ -121,9 +123,8 @@ class LoggedSource(StoredSource):
             firsts = [images.image(i, int(rows[0])) for i, rows in enumerate(clock.rows)]
             how = self._options
             self.framings = made = framings(firsts, how.size, how.fit, color=self.color)
-            self._spec = SourceSpec(
-                names, made[0].shape, str(firsts[0].dtype), (), self._fps, clock.start_ns, length
-            )
+            kinds = [framing.kind for framing in made]
+            self._spec = SourceSpec.of_kinds(names, kinds, (), self._fps, clock.start_ns, length)
             for i, rows in enumerate(clock.rows):  # refused before anything is written
                 self._frame(i, int(rows[0]), firsts[i])
         self.gaps = any(clock.gaps) and self._options.gaps == "skip"
@@ -172,7 +173,8 @@ class LoggedSource(StoredSource):
             return np.stack([framing.frame(image) for image in images]), truth
         if log.compressed is not None:
             self._expect(stream, t, rows)
-        frames = np.empty((len(rows), *self._spec.frame_shape), self._spec.dtype)
+        shape, dtype = self._spec.kind(stream)
+        frames = np.empty((len(rows), *shape), dtype)
         for i, row in enumerate(rows if isinstance(rows, range) else rows.tolist()):
             frames[i] = self._frame(stream, row)
         return frames, np.empty((len(rows), 0))
@@ -328,7 +330,7 @@ class LoggedSource(StoredSource):
                 "views": [{**one, **log} for one, log in zip(named, logs, strict=True)],
                 **shared,
             }
-        options, size = self._options, list(self._spec.frame_shape)
+        options, size = self._options, self._spec.size
         recipes = dict.fromkeys(stream.recipe for stream in self.streams)
         shared |= {"files": list(logs), "size": size, "rate": self._spec.fps}
         if self._arrays:
@@ -363,7 +365,8 @@ class LoggedSource(StoredSource):
         if options.fit != "crop" or any(framing.lossy for framing in self.framings if framing):
             chosen["fit"] = options.fit
         if options.range is not None:
-            chosen["range_metres" if self._spec.images else "range"] = list(options.range)
+            has_images = any(framing and framing.first for framing in self.framings)
+            chosen["range_metres" if has_images else "range"] = list(options.range)
         if not self._spec.images:
             chosen["fields"] = [list(stream.fields) for stream in self.streams]
         if options.time is not None:

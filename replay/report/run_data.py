@@ -18,6 +18,7 @@ from replay.runs.log import (
     EVENT_TOPIC,
     SIGNALS_TOPIC,
     TRUTH_TOPIC,
+    VALUES_TOPIC,
     WATCHED_TOPIC,
     Batch,
     Event,
@@ -26,7 +27,7 @@ from replay.runs.log import (
 from replay.runs.run import StoredRun, Tally
 from replay.truth_fits import TruthFit, truth_fits
 
-TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
+TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, VALUES_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
 # Frames on which a module's outputs are drawn and fitted: more dots would overlap in a plot.
 MOST_OUTPUTS = 2000
@@ -51,7 +52,7 @@ class ModuleData:
         frozen: the module.
         stream: sums and extremes over all frames.
         outputs: (n,) frames, (n, J) outputs and (n, D) truth, thinned; NaN where it is unknown.
-        frames: (n,) frames, (n, *frame_shape) values and (n,) first outputs, thinned further.
+        frames: (n,) frames, (n, ...) values and (n,) first outputs, thinned further.
         recent: (n,) frames and (n, J) outputs at the end.
     """
 
@@ -85,13 +86,19 @@ class ModuleData:
 
     def correlation(self, other: ModuleData) -> float:
         """Return |r| of the first outputs of this module and another one, on this one's frames."""
-        if not self.frames.columns or len(self.frames.columns[0]) < 8:
+        kind, kind_other = (self._spec.kind(m.frozen.stream_index) for m in (self, other))
+        if not self.frames.columns or len(self.frames.columns[0]) < 8 or kind != kind_other:
             return 0.0
         _, frames, y = self.frames.columns
         y_other = other.frozen.transform(frames)[:, 0]
         if not (np.std(y) > 0 and np.std(y_other) > 0):
             return 0.0
         return float(abs(np.corrcoef(y, y_other)[0, 1]))
+
+    @property
+    def images(self) -> bool:
+        """Whether the frames of its stream are images."""
+        return self._spec.of(self.frozen.stream_index).images
 
 
 class RunData:
@@ -110,7 +117,7 @@ class RunData:
         outline: outline of its signals.
         events: the first and the last.
         modules: at most `MOST_MODULES`.
-        watched: (n,) frames and (n, *frame_shape) values, thinned.
+        watched: (n,) frames and (n, *frame_shape) values, thinned; none if frames differ in shape.
         last: the last image of each stream, or its last rows of numbers.
         problems: a sentence for each damage or missing file.
         damage: sentences about damage.
@@ -152,11 +159,12 @@ class RunData:
         if len(self.events) > 2 * MOST_EVENTS:
             del self.events[MOST_EVENTS // 2 : -MOST_EVENTS // 2]
         for t, frames in batch.watched if len(batch.blocks.starts) else ():
-            self.watched.add(t, frames)
+            if not self.spec.kinds:
+                self.watched.add(t, frames)
             streams = batch.blocks.streams[batch.blocks.places(t)]
             for s in np.unique(streams).tolist():
                 rows = frames[streams == s][-VALUES:]
-                if self.spec.images:
+                if self.spec.of(s).images:
                     self.last[s] = rows[-1].copy()
                 else:
                     self.last[s] = np.concatenate([self.last.get(s, rows[:0]), rows])[-VALUES:]

@@ -127,7 +127,7 @@ def _cards(run: RunData) -> list[dict[str, Any]]:
         if outcome.get("why"):
             notes.append(str(outcome["why"]))
         image, plot, last = "", None, run.last.get(s) if place < 2 * OPEN_CARDS else None
-        if last is not None and run.spec.images:
+        if last is not None and run.spec.of(s).images:
             image = figures.data_uri(figures.reduced(last, figures.THUMBNAIL))
         elif last is not None:
             plot = figures.numbers_plot(last, f"Last {len(last)} frames of {name}")
@@ -149,7 +149,7 @@ def _cards(run: RunData) -> list[dict[str, Any]]:
 
 def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the measurements of a module, and for its section its images and plots."""
-    frozen, outline, images = module.frozen, run.outline, run.spec.images
+    frozen, outline, images = module.frozen, run.outline, module.images
     save = next((save for save in outline.saved if save.module == frozen.index), None)
     saved = outline.end if save is None else save.t + outline.tau
     truth_fits = module.truth_fits()

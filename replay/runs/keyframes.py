@@ -116,11 +116,19 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
 
 
 def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
-    """Return all arrays of a state by name: its own, and one for each field of its modules."""
+    """Return all arrays of a state by name: its own, and one for each field of its modules.
+
+    A field whose arrays have different shapes has one for each module, with its index from 0.
+    """
     names = [field.name for field in dataclasses.fields(Module) if field.name not in _OF_SOURCE]
-    return dict(state.arrays) | {
-        _MODULES + name: np.array([getattr(m, name) for m in state.modules]) for name in names
-    }
+    arrays = dict(state.arrays)
+    for name in names:
+        values = [np.asarray(getattr(m, name)) for m in state.modules]
+        if len({value.shape for value in values}) < 2:
+            arrays[_MODULES + name] = np.array(values)
+        else:  # modules for frames of different shapes
+            arrays |= {f"{_MODULES}{name}.{i}": value for i, value in enumerate(values)}
+    return arrays
 
 
 def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
@@ -136,7 +144,13 @@ def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
             raise LogDamagedError(f"{where}: a keyframe of version {facts['version']!r}")
         arrays = stored_arrays(facts["arrays"], decoded.values)
         of_modules = [name for name in arrays if name.startswith(_MODULES)]
-        columns = {name.removeprefix(_MODULES): arrays.pop(name) for name in of_modules}
+        columns: dict[str, Any] = {}
+        for name in of_modules:
+            field, _, index = name.removeprefix(_MODULES).partition(".")
+            if not index:
+                columns[field] = arrays.pop(name)
+            else:
+                columns.setdefault(field, []).append(arrays.pop(name))
         state = LearnerState(arrays, _modules(columns), dict(facts["policy_rng"]))
         return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]))
     # SystemError is NumPy's for text with code points that are no characters.
@@ -144,9 +158,9 @@ def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
         raise LogDamagedError(f"{where}: not a keyframe ({one_line(error)})") from error
 
 
-def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
+def _modules(columns: Mapping[str, NDArray[Any] | list[NDArray[Any]]]) -> tuple[Module, ...]:
     values: Any = {
-        name: column.tolist() if column.ndim == 1 else list(column)
+        name: column.tolist() if isinstance(column, np.ndarray) and column.ndim == 1 else column
         for name, column in columns.items()
     }
     rows = zip(*values.values(), strict=True)

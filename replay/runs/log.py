@@ -29,6 +29,9 @@ from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
 
 SIGNALS_TOPIC = "/signals"
 WATCHED_TOPIC = "/watched"
+# Numbers of the attended stream, if the source has images too.
+VALUES_TOPIC = "/values"
+FRAME_TOPICS = (WATCHED_TOPIC, VALUES_TOPIC)
 PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
@@ -124,12 +127,15 @@ def header_in(reader: LogReader) -> RunHeader:
         spec = parse_json(metadata["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
+        spec["kinds"] = tuple((tuple(shape), str(kind)) for shape, kind in spec.get("kinds", ()))
+        if len(spec["kinds"]) not in (0, len(spec["streams"])):
+            raise ValueError("it has other kinds than streams")
         return RunHeader(SourceSpec(**spec), parse_json(metadata["manifest"], MAX_LIST))
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
 
-TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
+TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, VALUES_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
 # Most iterations of a batch.
 BATCH_ITERATIONS = 500
@@ -150,7 +156,7 @@ class Batch:
     Attributes:
         blocks: the last block before the batch, to which its first messages may belong, then the
             blocks of `signals`; empty if the signals are not read.
-        watched: frames of the attended stream.
+        watched: frames of the attended stream, in an entry for each shape of frames.
         truth: ground truth, (n, D).
         phi: (t, (J, I)) weights of the abstraction.
     """
@@ -227,6 +233,9 @@ class BatchReader:
         topics: Sequence[str] = TOPICS,
     ) -> None:
         self._log, self._spec, self._every = log, header.spec, every
+        kinds = self._spec.every_kind
+        self._images = {shape for shape, dtype in kinds if len(shape) == 2 and dtype == "uint8"}
+        self._numbers = {shape for shape, _ in kinds} - self._images
         self._wanted = {n: c.topic for n, c in channels.items() if c.topic in topics}
         self._begin(Blocks.concatenated(()))
 
@@ -241,7 +250,7 @@ class BatchReader:
         """Take the messages of the next chunk, and yield the batches that end with them."""
         wanted = np.isin(table.channel, list(self._wanted))
         frames = self._spec.frames_at(table.log_time)
-        if self._spec.images and self._every > 1:
+        if self._images and self._every > 1:
             watched_channels = [n for n, topic in self._wanted.items() if topic == WATCHED_TOPIC]
             wanted &= ~np.isin(table.channel, watched_channels) | (frames % self._every == 0)
         if not wanted.all():
@@ -265,7 +274,8 @@ class BatchReader:
     def rest(self) -> Batch:
         """Return the messages since the last batch ended, as one batch."""
         spec, data = self._spec, self._data
-        watched = self._images() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
+        values_topic = VALUES_TOPIC if self._images else WATCHED_TOPIC
+        watched = *self._watched_images(), *self._rows(values_topic, *self._numbers)
         signals = self._records()
         blocks = Blocks.concatenated([self._before, *map(Blocks.of, signals)])
         events = zip(data[EVENT_TOPIC], self._frames[EVENT_TOPIC], strict=True)
@@ -301,25 +311,34 @@ class BatchReader:
                 raise LogDamagedError(f"{where}: a record has other streams than the run")
         return records
 
-    def _images(self) -> tuple[Frames, ...]:
-        """Return the decoded images of the batch as one array, or none."""
-        where, shape = f"{self._log} {WATCHED_TOPIC}", self._spec.frame_shape
-        images = [parsed(RawImage_pb2.RawImage, m, where).data for m in self._data[WATCHED_TOPIC]]
-        if not images:
-            return ()
-        for pixels in images:
-            if len(pixels) != math.prod(shape):
+    def _watched_images(self) -> Iterator[Frames]:
+        """Yield the decoded images of the batch, one array for each shape."""
+        if not self._images:
+            return
+        where, frames = f"{self._log} {WATCHED_TOPIC}", self._frames[WATCHED_TOPIC]
+        by_shape: dict[tuple[int, int], list[tuple[int, bytes]]] = {}
+        for t, message in zip(frames, self._data[WATCHED_TOPIC], strict=True):
+            image = parsed(RawImage_pb2.RawImage, message, where)
+            shape, pixels = (image.height, image.width), image.data
+            if shape not in self._images or len(pixels) != math.prod(shape):
                 raise LogDamagedError(f"{self._log}: {len(pixels)} values do not fill {shape}")
-        whole = np.frombuffer(b"".join(images), np.uint8).reshape(len(images), *shape)
-        return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), whole),)
+            by_shape.setdefault(shape, []).append((t, pixels))
+        for shape, images in by_shape.items():
+            numbers, parts = zip(*images, strict=True)
+            whole = np.frombuffer(b"".join(parts), np.uint8).reshape(len(parts), *shape)
+            yield np.array(numbers, dtype=np.int64), whole
 
-    def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
-        """Return the rows of matrix messages, one per frame."""
+    def _rows(self, topic: str, *shapes: tuple[int, ...]) -> tuple[Frames, ...]:
+        """Return the rows of matrix messages, one per frame, of one of some shapes."""
+        by_size = {math.prod(shape): shape for shape in shapes}
+        if not shapes:
+            return ()
         pieces = []
         for t, values in decode_matrices(self._data[topic], f"{self._log} {topic}"):
             frames = (t[:, None] + np.arange(values.shape[1])).reshape(-1)
-            if values.size != len(frames) * math.prod(shape):
-                raise LogDamagedError(f"{self._log}: {values.size} values do not fill {shape}")
+            shape = by_size.get(values.shape[2])
+            if shape is None:
+                raise LogDamagedError(f"{self._log}: {values.size} values do not fill {shapes[0]}")
             pieces.append((frames, values.reshape(-1, *shape)))
         return tuple(pieces)
 

@@ -65,10 +65,10 @@ class StoredRun:
             raise LogDamagedError(
                 f"{self.log.parent} has modules of streams that the run does not have"
             )
-        shape = self.header.spec.frame_shape
+        kind = self.header.spec.kind
         return tuple(
-            replace(module, stream=names[module.stream_index], frame_shape=shape)
-            for module in modules
+            replace(m, stream=names[m.stream_index], frame_shape=kind(m.stream_index)[0])
+            for m in modules
         )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +75,7 @@ class RunWriter(Sink):
             folders.RUN_METADATA,
             {
                 "schema": str(SCHEMA_VERSION),
-                "spec": json.dumps(asdict(spec)),
+                "spec": json.dumps(spec.as_json()),
                 "manifest": json.dumps(manifest, sort_keys=True),
                 "watched_every": str(self._watched_every),
             },
@@ -92,14 +91,16 @@ class RunWriter(Sink):
             keyframes.KEYFRAME_TOPIC, keyframes.KEYFRAME_SCHEMA, keyframes.KEYFRAME_DEFINITION
         )
         self._add_channel(log.EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
-        self._images: list[ImageEncoder] = []
-        if spec.images:
-            height, width = spec.frame_shape
-            self._images = [ImageEncoder(height, width, name) for name in spec.streams]
-            encoder = self._images[0]
+        self._images: dict[int, ImageEncoder] = {}
+        for stream, name in enumerate(spec.streams):
+            if spec.of(stream).images:
+                (height, width), _ = spec.kind(stream)
+                self._images[stream] = encoder = ImageEncoder(height, width, name)
+        self._values_topic = log.VALUES_TOPIC if self._images else log.WATCHED_TOPIC
+        if self._images:
             self._add_channel(log.WATCHED_TOPIC, encoder.schema, encoder.schema_data())
-        else:
-            self._add_channel(log.WATCHED_TOPIC, *matrix)
+        if len(self._images) < len(spec.streams):
+            self._add_channel(self._values_topic, *matrix)
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Write what one iteration gave; see `Sink`."""
@@ -107,14 +108,14 @@ class RunWriter(Sink):
         messages = [(log.SIGNALS_TOPIC, at, codec.encode_signals(signals))]
         if block.truth.shape[1]:
             messages.append((log.TRUTH_TOPIC, at, codec.encode_matrix(t, block.truth)))
-        if self._images:
+        if block.stream in self._images:
             encode, every = self._images[block.stream], self._watched_every
             for i in range(-t % every, len(block), every):
                 log_time = self.spec.time_ns(t + i)
                 messages.append((log.WATCHED_TOPIC, log_time, encode(log_time, block.frames[i])))
         else:
             frames = block.frames.reshape(len(block), -1)
-            messages.append((log.WATCHED_TOPIC, at, codec.encode_matrix(t, frames)))
+            messages.append((self._values_topic, at, codec.encode_matrix(t, frames)))
         leaves = self._by_progress and signals.action == 1
         self._without_weights = at, k, t, learner
         if k % self._phi_every == 0 or signals.saved or leaves:

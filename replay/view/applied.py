@@ -48,9 +48,9 @@ class ViewSink:
         stream = part(self._spec.streams, s)
         frames = np.arange(block.t, block.t + len(block))
         self._end = max(self._end, block.t + len(block))
-        drawn = frames % (EVERY if self._spec.images else 1) == 0
+        drawn = frames % (EVERY if self._spec.of(s).images else 1) == 0
         at = frames[drawn], None
-        self._writer.frames(view_entities(self._spec)[s], at, block.frames[drawn])
+        self._writer.frames(view_entities(self._spec)[s], at, block.frames[drawn], s)
         first, names = (frames[:1], None), [f"module {m.index}" for m, _ in self._modules]
         slowness = applied.block_slowness[[columns.start for _, columns in self._modules]]
         slowness = np.where(np.isfinite(slowness), slowness, np.nan)
@@ -72,7 +72,7 @@ class ViewSink:
         stream, name = part(self._spec.streams, s), drawable(self._spec.streams[s])
         entity, end = f"/{view_entities(self._spec)[s]}", self._end
         column = rrb.Vertical(
-            images(entity, name) if self._spec.images else curve_view(name, [entity], end),
+            images(entity, name) if self._spec.of(s).images else curve_view(name, [entity], end),
             curve_view("Novelty of each block: explained up to 1", [f"/novelty/{stream}"], end),
             curve_view(
                 "Slowness within each block, first outputs [cycles/frame]",

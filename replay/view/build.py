@@ -189,14 +189,15 @@ def _write_recording(
         world = None if scenery is None else SceneView(writer, scenery, every)
         for note in (*source.warnings, *(world.notes if world is not None else ())):
             writer.event(first, None, note, "WARN")
-        step, entities = every if spec.images else 1, view_entities(spec)
+        entities = view_entities(spec)
+        steps = [every if spec.of(s).images else 1 for s in range(len(entities))]
         for t in range(first, first + count, BLOCK):
             for stream, entity in enumerate(entities):
                 for low, high in source.spans(stream, t, min(t + BLOCK, first + count)):
                     source.seek(low)
                     block, frames = source.take(stream, high - low), np.arange(low, high)
-                    drawn = frames % step == 0
-                    writer.frames(entity, (frames[drawn], None), block.frames[drawn])
+                    drawn = frames % steps[stream] == 0
+                    writer.frames(entity, (frames[drawn], None), block.frames[drawn], stream)
                     if spec.truth and stream == 0:
                         writer.lines("world/truth", spec.truth, (frames, None), block.truth, gap=1)
                         if world is not None:
@@ -227,11 +228,14 @@ def recording_layout(
     """
     places = list(zip(view_entities(spec), map(drawable, spec.streams), strict=True))
     tabs = list[rrb.Container]()
-    views: rrb.Container = rrb.Vertical(
-        *(curve_view(name, [f"/{entity}"], end) for entity, name in places)
-    )
+    views_of = [
+        images(f"/{entity}", name)
+        if spec.of(stream).images
+        else curve_view(name, [f"/{entity}"], end)
+        for stream, (entity, name) in enumerate(places)
+    ]
+    views: rrb.Container = rrb.Vertical(*views_of)
     if spec.images:
-        views_of = [images(f"/{entity}", name) for entity, name in places]
         views = rrb.Grid(*views_of, grid_columns=min(len(views_of), 3))
     if has_scene:
         column = rrb.Vertical(*(images(f"/{entity}", name) for entity, name in places))

@@ -104,7 +104,7 @@ class ImageGridView:
             for s in self._paths.keys() & set(streams.tolist()):
                 rows = last[streams == s]
                 at = frames[rows], blocks.iterations[places[rows]]
-                self._writer.frames(self._paths[s], at, images[rows])
+                self._writer.frames(self._paths[s], at, images[rows], s)
 
     def _frame(self, columns: SignalColumns) -> None:
         """Put the border around the attended stream, of size 0 if the stream is not visible."""

@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import Block, FrameKind, SourceSpec
 from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
@@ -83,13 +83,13 @@ class LiveView(Sink):
         self._view = RunView(writer, header, shown, run or Path(), every=EVERY_FRAMES, piece=PIECE)
         has_scene = isinstance(self._view.world, SceneView)
         self._recording.send_blueprint(run_layout(empty, has_scene=has_scene))
-        self._images = spec.images
+        self._spec = spec
         self._next = time.monotonic() + EVERY_SECONDS
         self._clear()
 
     def _clear(self) -> None:
         self._records: list[BlockSignals] = []
-        self._watched: list[NDArray[Any]] = []
+        self._watched: dict[FrameKind, list[tuple[NDArray[Any], NDArray[Any]]]] = {}
         self._truth: list[NDArray[np.float64]] = []
         self._phi: list[tuple[int, NDArray[np.float64]]] = []
 
@@ -99,7 +99,9 @@ class LiveView(Sink):
             self._phi.pop()  # of the abstraction's weights, the last and the saved ones are shown
         self._phi.append((block.t, weights_after(signals, learner)))
         self._records.append(signals)
-        self._watched.append(block.frames[:1].copy() if self._images else block.frames)
+        count = 1 if self._spec.of(block.stream).images else len(block)
+        watched = self._watched.setdefault(self._spec.kind(block.stream), [])
+        watched.append((block.t + np.arange(count), block.frames[:count].copy()))
         self._truth.append(block.truth)
         if len(self._records) >= MOST_BLOCKS or time.monotonic() >= self._next:
             self.flush()
@@ -132,7 +134,12 @@ class LiveView(Sink):
             batch = Batch(
                 signals=signals,
                 blocks=Blocks.concatenated([*map(Blocks.of, signals)]),
-                watched=((starts if self._images else frames, np.concatenate(self._watched)),),
+                watched=tuple(
+                    (np.concatenate(t), np.concatenate(values))
+                    for t, values in (
+                        zip(*of_kind, strict=True) for of_kind in self._watched.values()
+                    )
+                ),
                 truth=((frames, np.concatenate(self._truth)),),
                 phi=tuple(self._phi),
                 events=(),

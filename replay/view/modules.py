@@ -24,7 +24,7 @@ from replay.runs.run import Outline
 from replay.truth_fits import truth_fits
 from replay.view.image_grid import BETWEEN, grid_positions, place_image, sheet_size
 from replay.view.layouts import Panel
-from replay.view.writer import Writer, drawable
+from replay.view.writer import Writer, drawable, for_stream
 
 PHI = "abstraction/phi"
 
@@ -53,26 +53,30 @@ def saved_mark() -> rr.SeriesPoints:
 
 
 def hang_weights(
-    writer: Writer, path: str, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
+    writer: Writer, path: str, stream: int, labels: Sequence[str], rgbs: Sequence[Rgb] = ()
 ) -> None:
     """Place the weights of several outputs in a grid, with gray borders by default."""
-    if not writer.spec.images or len(labels) == 1:
+    spec = writer.spec.of(stream)
+    if not spec.images or len(labels) == 1:
         return
-    height, width = writer.spec.frame_shape
+    height, width = spec.frame_shape
     corners = grid_positions(len(labels), width, height)
     for j, (words, corner) in enumerate(zip(labels, corners, strict=True)):
         rgb = rgbs[j] if rgbs else GREY
         place_image(writer, f"{path}/{j + 1}", corner, (width, height), words, rgb)
 
 
-def write_weights(writer: Writer, path: str, t: int, iteration: int, phi: FloatArray) -> None:
-    """Show (J, I) weights at a frame and iteration: as images, or bars.
+def write_weights(
+    writer: Writer, path: str, stream: int, t: int, iteration: int, phi: FloatArray
+) -> None:
+    """Show (J, I) weights for frames of a stream at a frame and iteration: as images, or bars.
 
     Each output's image, at `path` or of several at `path/<number>`, is in full color at its own
     largest weight.
     """
-    shape = writer.spec.frame_shape
-    if not writer.spec.images or phi.shape[1] != shape[0] * shape[1]:
+    spec = writer.spec.of(stream)
+    shape = spec.frame_shape
+    if not spec.images or phi.shape[1] != shape[0] * shape[1]:
         writer.log_at(path, t, iteration, rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST)))
         return
     for j, weights in enumerate(phi):
@@ -109,17 +113,20 @@ class Weights:
             owners = owners if self._by_progress else watched
             signals = (columns.frames, columns.iterations, watched, owners)
             for t, iteration, s, owner in zip(*(v.tolist() for v in signals), strict=True):
-                phi, visible = logged.get(t), None
-                if self._by_progress and s != self._stream and self._phi:
+                phi, visible, spec = logged.get(t), None, self._writer.spec
+                if self._by_progress and s != self._stream and self._phi and not spec.kinds:
                     visible = self._phi.get(s, 0 * next(iter(self._phi.values())))
                 self._stream = s
                 if phi is not None:
-                    if not self._phi:
-                        hang_weights(self._writer, PHI, _numbers(phi))
+                    if not self._phi or (spec.kinds and owner not in self._phi):
+                        place = for_stream(PHI, spec, owner)
+                        hang_weights(self._writer, place, owner, _numbers(phi))
                     self._phi[owner] = phi
-                    visible = phi if owner == s else visible
+                    visible = phi if owner == s or spec.kinds else visible
                 if visible is not None:
-                    write_weights(self._writer, PHI, t, iteration, visible)
+                    stream = owner if spec.kinds else s
+                    place = for_stream(PHI, spec, stream)
+                    write_weights(self._writer, place, stream, t, iteration, visible)
 
 
 class ModulesView:
@@ -187,12 +194,14 @@ class ModulesView:
             labels = [f"{j} {'slow' if one else 'not slow'}" for j, one in enumerate(slow, 1)]
             rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in slow]
             labels = labels or _numbers(module.phi)
-            hang_weights(self._writer, f"{place}/weights", labels, rgbs)
+            of = f"{place}/weights", module.stream_index
+            hang_weights(self._writer, *of, labels, rgbs)
             at = saved.get(number, outline.end), module.iteration
-            write_weights(self._writer, f"{place}/weights", *at, module.phi)
-            if self._writer.spec.images and stream.count:
+            write_weights(self._writer, *of, *at, module.phi)
+            spec = self._writer.spec.of(module.stream_index)
+            if spec.images and stream.count:
                 self.sheets.add(number)
-                self._write_sheet(place, stream.sheet())
+                self._write_sheet(place, stream.sheet(), *spec.frame_shape)
         return self._notes
 
     def _saved(self, columns: SignalColumns, weights: dict[int, FloatArray]) -> None:
@@ -204,8 +213,9 @@ class ModulesView:
             self._writer.log(f"{place}/saved", saved_mark())
             self._writer.log_at(f"{place}/saved", t + columns.tau, iteration, rr.Scalars([0.0]))
             if number not in self._known and t in weights:
-                hang_weights(self._writer, f"{place}/weights", _numbers(weights[t]))
-                write_weights(self._writer, f"{place}/weights", t, iteration, weights[t])
+                of = f"{place}/weights", stream
+                hang_weights(self._writer, *of, _numbers(weights[t]))
+                write_weights(self._writer, *of, t, iteration, weights[t])
 
     def _output(self, number: int, t: IntArray, iterations: IntArray, y: FloatArray) -> None:
         """Draw the (n, J) outputs of a module at n frames; only slow ones where any is slow."""
@@ -262,9 +272,10 @@ class ModulesView:
         self._writer.flush()
         return panels
 
-    def _write_sheet(self, place: str, sheet: Mapping[str, Sequence[SampledFrame]]) -> None:
+    def _write_sheet(
+        self, place: str, sheet: Mapping[str, Sequence[SampledFrame]], height: int, width: int
+    ) -> None:
         """Hang frames of least, middle and greatest output below one another."""
-        height, width = self._writer.spec.frame_shape
         gap = np.full((height, BETWEEN), DARK[0], dtype=np.uint8)
         corners = grid_positions(len(sheet), *sheet_size(height, width), columns=1)
         hung = zip(sheet.items(), corners, strict=True)

@@ -24,7 +24,7 @@ from replay.runs.run import Outline, rules_of
 from replay.view.modules import ModulesView, Weights, saved_mark
 from replay.view.scene import world_of_run
 from replay.view.state_timelines import StateTimelines
-from replay.view.writer import WIDTH, Writer, changes, drawable, part, power_of_ten
+from replay.view.writer import WIDTH, Writer, changes, drawable, for_stream, part, power_of_ten
 
 # Signals that are timelines of the view, not curves.
 TIMELINES = ("iteration", "t", "log_time")
@@ -47,7 +47,8 @@ HARDLY_WATCHED = 1000.0
 # Blocks over which the share of each stream is averaged; the titles of panels state 50.
 SHARE_BLOCKS = 50
 
-WATCHED_NAME = "world/watched/name"
+WATCHED = "world/watched"
+WATCHED_NAME = f"{WATCHED}/name"
 
 
 class RunView:
@@ -125,8 +126,14 @@ class Inputs:
     def take(self, batch: Batch) -> None:
         """Write the messages of some iterations."""
         for frames, values in batch.watched:
-            at = frames, batch.blocks.iteration(frames)
-            self._writer.frames("world/watched", at, values)
+            iterations = batch.blocks.iteration(frames)
+            if not self._spec.kinds:
+                self._writer.frames(WATCHED, (frames, iterations), values, 0)
+                continue
+            streams = batch.blocks.streams[batch.blocks.places(frames)]
+            for s in np.unique(streams).tolist():
+                at, place = streams == s, for_stream(WATCHED, self._spec, s)
+                self._writer.frames(place, (frames[at], iterations[at]), values[at], s)
         for frames, truth in batch.truth if self._spec.truth else ():
             at = frames, batch.blocks.iteration(frames)
             self._writer.lines("world/truth", self._spec.truth, at, truth, gap=1)

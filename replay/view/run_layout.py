@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import rerun.blueprint as rrb
 
+from cdmisfa.core.blocks import SourceSpec
 from replay.runs.log import PHI_EVERY
 from replay.runs.run import Outline
 from replay.view import layouts
 from replay.view.image_grid import GRID, grid_bounds, sheet_size
 from replay.view.layouts import RECENT, Panel, Tab, Views, beside, curve_view, images
-from replay.view.writer import MOST_STREAMS, Interval, Writer, drawable
+from replay.view.writer import MOST_STREAMS, Interval, Writer, drawable, for_stream
 
 # Most modules with a page each; of more modules, the number on one page.
 PAGES, MOST_MODULES = 12, 6
@@ -191,9 +192,9 @@ class RunLayout:
         """Return a module's page: weights, frames, and its output, also around its save."""
         left, output = ([view] for view in self._module_views(i))
         name = f"Module {i}"
-        if has_sheet:
+        if has_sheet and (spec := self._spec_of(i)) is not None:
             title = "Frames with the least, middle and greatest output 1"
-            width, height = sheet_size(*self._spec.frame_shape)
+            width, height = sheet_size(*spec.frame_shape)
             bounds = grid_bounds(3, height, width, columns=1)
             left.append(images(f"/modules/{i}/sheet", title, bounds))
         for save in (save for save in self._outline.saved if save.module == i):
@@ -217,7 +218,9 @@ class RunLayout:
         colours = self._facts["colours"]
         output = f"Output of module {i} [SD] while its stream was attended"
         return [
-            self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}"),
+            self._weights_of(
+                f"/modules/{i}/weights", f"Weights of module {i}{colours}", self._spec_of(i)
+            ),
             curve_view(output, [f"/modules/{i}/output", f"/modules/{i}/saved"], self._end),
         ]
 
@@ -235,14 +238,48 @@ class RunLayout:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
-        values = curve_view("Input values", ["/world/watched"], recent=RECENT)
+        values: Views = [
+            images(path, title)
+            if self._spec.of(s).images
+            else curve_view(title, [path], recent=RECENT)
+            for s, path, title in self._places("/world/watched", "Input values")
+        ]
         whose = layouts.state_rows("Attended stream", ["/attended/each_block"], recent=RECENT)
-        return rrb.Vertical(values, whose, row_shares=[3, 2])
+        return rrb.Vertical(*values, whose, row_shares=[*(3 for _ in values), 2])
 
-    def _weights(self, path: str, name: str) -> rrb.View:
+    def _places(self, path: str, title: str) -> Iterator[tuple[int, str, str]]:
+        """Yield stream, entity and title of each kind of frames: one if all have one kind."""
+        if not self._spec.kinds:
+            yield 0, path, title
+            return
+        for s in range(min(len(self._spec.streams), MOST_STREAMS)):
+            title_of = f"{drawable(self._spec.streams[s])}: {title}"
+            yield s, for_stream(path, self._spec, s), title_of
+
+    def _spec_of(self, module: int) -> SourceSpec | None:
+        """Return the spec of a module's stream; None if frames differ and it is unknown."""
+        if not self._spec.kinds:
+            return self._spec
+        streams = (save.stream for save in self._outline.saved if save.module == module)
+        stream = next(streams, None)
+        return None if stream is None else self._spec.of(stream)
+
+    def _weights(self, path: str, name: str) -> rrb.View | rrb.Container:
+        """Return the weights of the candidate of the attended stream, of each kind of frames."""
+        places = self._places(path, name)
+        return beside([self._weights_of(p, title, self._spec.of(s)) for s, p, title in places])
+
+    def _weights_of(
+        self, path: str, name: str, spec: SourceSpec | None
+    ) -> rrb.View | rrb.Container:
+        """Return weights for frames of a spec: as images, or bars; both if it is unknown."""
+        views: Views = []
         outputs = self._outline.outputs
-        if not self._spec.images:
+        if spec is None or spec.images:
+            several = spec is not None and outputs > 1
+            bounds = grid_bounds(outputs, *spec.frame_shape) if spec and several else None
+            views.append(images(path, name, bounds))
+        if spec is None or not spec.images:
             hidden = rrb.PlotLegend(visible=False)
-            return rrb.BarChartView(origin=path, name=name, plot_legend=hidden)
-        bounds = grid_bounds(outputs, *self._spec.frame_shape) if outputs > 1 else None
-        return images(path, name, bounds)
+            views.append(rrb.BarChartView(origin=path, name=name, plot_legend=hidden))
+        return beside(views)

@@ -84,6 +84,11 @@ def part(names: Sequence[str], index: int) -> str:
     return str(rr.escape_entity_path_part(f"{index + 1}_{drawable(names[index])}"))
 
 
+def for_stream(path: str, spec: SourceSpec, stream: int) -> str:
+    """Return the entity of a stream's frames or weights: one for all if they have one kind."""
+    return f"{path}/{part(spec.streams, stream)}" if spec.kinds else path
+
+
 def power_of_ten(values: FloatArray) -> FloatArray:
     """Return the logarithms of values to the base of ten; NaN for values that have none."""
     return np.log10(np.where(values > 0, values, np.nan))
@@ -194,10 +199,11 @@ class Writer:
             )
         self.buffer(path, at, values, style, gap=gap)
 
-    def frames(self, path: str, at: At, values: NDArray[Any]) -> None:
-        """Buffer frames of the source: gray images, or lines of values."""
-        shape = self.spec.frame_shape
-        if self.spec.images:
+    def frames(self, path: str, at: At, values: NDArray[Any], stream: int) -> None:
+        """Buffer frames of a stream, or of one with the same kind: gray images, or lines."""
+        spec = self.spec.of(stream)
+        shape = spec.frame_shape
+        if spec.images:
             form = rr.components.ImageFormat(
                 width=shape[1], height=shape[0], color_model="L", channel_datatype="U8"
             )

@@ -238,14 +238,14 @@ class Candidates(dict[int, Candidate]):
     """The candidates in memory, by the index of their stream.
 
     Args:
-        new: creates a candidate.
-        size: size of one candidate (bytes).
+        new: creates a candidate of a stream.
+        size: size of the largest candidate (bytes).
 
     Attributes:
         capacity: largest number of candidates in memory.
     """
 
-    def __init__(self, new: Callable[[], Candidate], size: int) -> None:
+    def __init__(self, new: Callable[[int], Candidate], size: int) -> None:
         super().__init__()
         self._new = new
         self.capacity = max(2, min(MAX_CANDIDATES, MAX_CANDIDATE_BYTES // size))
@@ -264,7 +264,7 @@ class Candidates(dict[int, Candidate]):
             while len(self) >= self.capacity:
                 idle = [s for s in self if not learning[s]]
                 del self[min(idle or self, key=lambda s: last[s])]
-            self[stream] = self._new()
+            self[stream] = self._new(stream)
         return self[stream]
 
     @property
@@ -288,5 +288,5 @@ class Candidates(dict[int, Candidate]):
         for stream in arrays["held"].tolist():
             prefix = f"candidate.{stream}."
             parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-            self[stream] = self._new()
+            self[stream] = self._new(stream)
             self[stream].restore(parts)

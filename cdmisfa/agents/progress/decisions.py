@@ -225,7 +225,7 @@ def is_promising(candidate: Candidate, config: ProgressConfig) -> bool:
 
 
 def explaining_module(
-    candidate: Candidate, modules: list[Module], previous: int, frames: NDArray[Any]
+    candidate: Candidate, modules: Mapping[int, Module], previous: int, frames: NDArray[Any]
 ) -> int | None:
     """Return the index of the saved module that gives a candidate's feature, or None.
 
@@ -234,12 +234,12 @@ def explaining_module(
 
     Args:
         candidate: candidate of the stream.
-        modules: the saved modules.
+        modules: the saved modules for frames of the candidate's kind, by index.
         previous: index of the module that the stream had before, tried first; -1 for none.
         frames: (n, I) the last block of the stream, see `RecursiveFeature.compare`.
     """
     low, high = MODULE_VARIANCE_BOUNDS
-    similar = [i for i, module in enumerate(modules) if _similar_mean(module, candidate)]
+    similar = [i for i, module in modules.items() if _similar_mean(module, candidate)]
     for index in sorted(similar, key=lambda index: index != previous):
         variance, eta, rho = candidate.sfa.compare(modules[index].phi[0], frames)
         if (

@@ -15,14 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-from cdmisfa.agents.inputs import count_inputs, rows_of, signals_of_block
+from cdmisfa.agents.inputs import rows_of, signals_of_block
 from cdmisfa.agents.progress import decisions
 from cdmisfa.agents.progress.attention import ERROR_BLOCKS, RULES, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate, Candidates
 from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.kinds import FrameKinds
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
-from cdmisfa.core.expansion import expand, expanded_size
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.outcomes import NO_PROGRESS, outcome_text
 from cdmisfa.core.signals import STATES, BlockSignals
@@ -69,24 +70,18 @@ class ProgressLearner:
         self.config, self.spec = config, spec
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
-        # With more products than whitened components the slow features are lost among them: a sine
-        # mixed with noise is learned from frames of 4 values, and not of 7 (decision 0032 of
-        # docs/project/decisions.md).
-        few = expanded_size("quadratic", math.prod(spec.frame_shape)) <= config.components
-        self._expansion = config.expansion or ("quadratic" if few else "none")
-        self._n_inputs = count_inputs(self._expansion, spec)
-        self._n_outputs = min(config.outputs, self._n_inputs)
-        self._scale = PIXEL if spec.dtype == "uint8" else 1.0
+        self._kinds = FrameKinds(spec, config)
+        self._n_outputs, most = self._kinds.outputs, self._kinds.most_inputs
         self._test_window = max(MIN_TEST_BLOCKS, -(-config.test_frames // config.tau))
         self._monitor_window = int(MONITOR_WINDOWS * self._test_window)
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
         self._streams = decisions.new_streams(len(spec.streams))
-        size = 8 * self._n_inputs * (STORED_PER_COMPONENT * config.components + self._n_outputs + 4)
+        size = 8 * most * (STORED_PER_COMPONENT * config.components + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
         self.rule = RULES[config.attention]
-        self._stack_modules()
+        self._kinds.stack(self.modules)
 
     @property
     def tau(self) -> int:
@@ -119,7 +114,8 @@ class ProgressLearner:
         """(J, I) weights of the candidate of the next stream, a copy."""
         candidate = self._candidates.get(self.stream)
         if candidate is None:
-            return np.zeros((self._n_outputs, self._n_inputs))
+            size = self._kinds.inputs(self.stream).size
+            return np.zeros((min(self.config.outputs, size), size))
         return candidate.sfa.phi
 
     @property
@@ -152,7 +148,7 @@ class ProgressLearner:
         overwrite(self._tables, state.arrays)
         self._candidates.restore(state.arrays)
         self.modules = list(state.modules)
-        self._stack_modules()
+        self._kinds.stack(self.modules)
         self._rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:
@@ -165,39 +161,40 @@ class ProgressLearner:
             ValueError: the block has a different stream, length, frame shape or type.
             CdmisfaError: the block holds a value that is not finite.
         """
-        frames = expand(self._expansion, rows_of(block, self.spec, self.stream, self.tau))
         stream, count = block.stream, len(self.modules)
+        rows = rows_of(block, self.spec, self.stream, self.tau)
+        frames = expand(self._kinds.inputs(stream).expansion, rows)
         row, counts = self._streams[stream], self._counts[0]
         undecided = int(row["state"]) == decisions.LEARNING
         candidate = self._candidates.get_or_create(stream, self._learning, self._streams["last"])
-        y_frozen = kernels.outputs(self._phi, self._offset, frames)
+        y_frozen = self._kinds.module_outputs(stream, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(row["next"]) != block.t)
         row["next"], row["last"] = block.t + len(block), counts["iteration"]
         row["visits"] += 1
         counts["iteration"] += 1
         if int(row["module"]) >= 0:
-            decisions.monitor_output(
-                row, y_frozen[:, int(row["module"]) * self._n_outputs], self._monitor_window
-            )
+            decisions.monitor_output(row, y_frozen[int(row["module"]), :, 0], self._monitor_window)
         self.events = self._decide(stream, candidate, frames) + self._retry_rejected()
         counts["idle"] = 0 if self._learning.any() else counts["idle"] + 1
         interests, explored = self._choose(self._rng.random(2))
         tested, gained = candidate.tested, error - candidate.error
-        frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
-        slowness = [kernels.instantaneous_slowness(y) for y in frozen]
+        slowness = [kernels.instantaneous_slowness(y) for y in y_frozen]
+        y = self._kinds.wide(candidate.y)
         shape = (count, self._n_outputs)
         signals: dict[str, Any] = {
             "novel": undecided and candidate.varies,
             "known_by": int(row["module"]) + 1 if candidate.varies else -1,
             "saved": len(self.modules) > count,
             "novel_blocks": candidate.blocks,
-            "y": candidate.y,
-            "y_frozen": np.ascontiguousarray(frozen),
-            "eta": tested,
-            "eta_inst": kernels.instantaneous_slowness(candidate.y),
+            "y": y,
+            "y_frozen": y_frozen,
+            "eta": self._kinds.wide(tested),
+            "eta_inst": kernels.instantaneous_slowness(y),
             "eta_inst_frozen": np.array(slowness).reshape(shape),
-            "band_mean": np.array([module.eta for module in self.modules[:count]]).reshape(shape),
+            "band_mean": np.array([self._kinds.wide(m.eta) for m in self.modules[:count]]).reshape(
+                shape
+            ),
             "curiosity": gained,
             "reward": gained,
             "R": np.empty((0, 2, 0)),
@@ -216,8 +213,8 @@ class ProgressLearner:
             "regret": candidate.improvement,
         }
         if candidate.tests:
-            signals["variance"] = candidate.variance
-        sizes = {"outputs": len(tested), "modules": count}
+            signals["variance"] = self._kinds.wide(candidate.variance)
+        sizes = {"outputs": self._n_outputs, "modules": count}
         return signals_of_block(block, self.spec, self.iteration - 1, **sizes, **signals)
 
     def summary(self) -> dict[str, Any]:
@@ -245,9 +242,9 @@ class ProgressLearner:
         """(S,) 0 (stay) where a stream is being learned, else 1 (switch)."""
         return np.where(self._learning, 0, 1)
 
-    def _new_candidate(self) -> Candidate:
-        c = self.config
-        return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._test_window)
+    def _new_candidate(self, stream: int) -> Candidate:
+        c, size = self.config, self._kinds.inputs(stream).size
+        return Candidate(size, c.components, c.outputs, c.window, self._test_window)
 
     def _decide(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
         """Decide about a stream after a block of it, and return the events."""
@@ -298,11 +295,12 @@ class ProgressLearner:
         row = self._streams[stream]
         state, before = int(row["state"]), int(row["module"])
         if index is None:
-            index = decisions.explaining_module(candidate, self.modules, before, frames)
+            modules = {i: self.modules[i] for i in self._kinds.modules_for(stream)}
+            index = decisions.explaining_module(candidate, modules, before, frames)
         new = index is None
         if index is None:
             self.modules.append(self._module(stream, candidate))
-            self._stack_modules()
+            self._kinds.stack(self.modules)
             index = len(self.modules) - 1
         module = self.modules[index]
         given = candidate.sfa.compare(module.phi[0], frames)
@@ -317,7 +315,7 @@ class ProgressLearner:
             return self._event(stream, f"is still explained by module {index + 1}")
         text = outcome_text(STATES[state], index + 1, int(row["decided"]), eta)
         if new and self._n_outputs > 1:
-            text += f"; {int(module.slow.sum())} of {self._n_outputs} outputs slow"
+            text += f"; {int(module.slow.sum())} of {len(module.slow)} outputs slow"
         return self._event(stream, f"{'has changed and is' if before >= 0 else 'is'} {text}")
 
     def _learn_again(self, stream: int, module: int) -> None:
@@ -343,6 +341,7 @@ class ProgressLearner:
         return (f"looking again at rejected streams: {names}",) if names else ()
 
     def _module(self, stream: int, candidate: Candidate) -> Module:
+        inputs = self._kinds.inputs(stream)
         return Module(
             index=len(self.modules) + 1,
             stream=self.spec.streams[stream],
@@ -351,20 +350,14 @@ class ProgressLearner:
             phi=candidate.sfa.phi,
             mean=candidate.sfa.mean.copy(),
             band_mean=candidate.tested,
-            band_sd=np.full(self._n_outputs, np.nan),
+            band_sd=np.full(len(candidate.tested), np.nan),
             eta=candidate.tested,
             policy=self._policy,
-            expansion=self._expansion,
-            scale=self._scale,
+            expansion=inputs.expansion,
+            scale=inputs.scale,
             slow=decisions.slow_outputs(candidate, self.config),
-            frame_shape=self.spec.frame_shape,
+            frame_shape=self.spec.kind(stream)[0],
         )
-
-    def _stack_modules(self) -> None:
-        """Stack the weights of all modules, so that one pass over a block computes all outputs."""
-        self._phi = np.array([m.phi for m in self.modules]).reshape(-1, self._n_inputs)
-        offsets = [kernels.mean_output(m.phi, m.mean) for m in self.modules]
-        self._offset = np.array(offsets).reshape(-1)
 
     def _choose(self, draws: FloatArray) -> tuple[FloatArray, bool]:
         """Choose the next stream.

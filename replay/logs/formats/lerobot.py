@@ -64,7 +64,7 @@ class Dataset:
 def streams(
     path: Path, options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
 ) -> list[LogStream]:
-    """Open the cameras of a dataset, or the numbers that are asked for as one stream.
+    """Open cameras of a dataset, features that are topics, and `options.fields` as one stream.
 
     A dataset without cameras is read as all its numbers, without the numbers of frames.
 
@@ -73,16 +73,20 @@ def streams(
         LogDamagedError: its tables cannot be read, or contradict each other.
     """
     numeric, cameras = features(path)
-    if not cameras and not options.fields:
-        fields = tuple(name for name in numeric if name not in _CLOCK)
-        options = replace(options, fields=fields)
-    if options.fields:
-        return [_numbers(path, options)]
-    chosen = [c for c in cameras if not options.topics or fits_topic(c, options.topics)]
-    if not chosen or (not options.topics and len(chosen) > 1):
-        wrong = f"no topic {', '.join(options.topics)}" if options.topics else "choose a --topic"
+    name, topics, fields = path.resolve().name, options.topics, options.fields
+    chosen = [c for c in cameras if (fits_topic(c, topics) if topics else not fields)]
+    numbers: dict[str, tuple[str, ...]]
+    numbers = {topic: (topic,) for topic in numeric if topic in topics and not fields}
+    if not (cameras or topics or fields):
+        fields = tuple(topic for topic in numeric if topic not in _CLOCK)
+    if fields:
+        if not chosen:
+            check_topics(path, name, topics)
+        numbers = {name: fields}
+    if not (chosen or numbers) or (not topics and len(chosen) > 1):
+        wrong = f"no topic {', '.join(topics)}" if topics else "choose a --topic"
         raise NoTopicError(f"{path}: {wrong}; it has images on: {', '.join(cameras) or 'none'}")
-    opened_streams = []
+    opened_streams = [_numbers(path, topic, names, options) for topic, names in numbers.items()]
     for topic in chosen:
         camera = _Camera(path, topic, color=options.color is True)
         opened.callback(camera.close)
@@ -179,10 +183,9 @@ class _Camera:
         return data
 
 
-def _numbers(path: Path, options: InputOptions) -> LogStream:
+def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptions) -> LogStream:
     """Return fields of a dataset, as observation.state and action, one row of numbers a frame."""
-    topic, names, what = path.resolve().name, options.fields, ", ".join(options.fields)
-    check_topics(path, topic, options.topics)
+    what = ", ".join(names)
     known = features(path)[0]
     if absent := [name for name in names if name not in known]:
         raise UsageError(f"{path}: no field {absent[0]}; choose from {', '.join(known)}")

@@ -13,11 +13,14 @@ import numpy as np
 
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.fields import EVERY
 from recorder.images.messages import (
     PACKED,
     SCHEMAS,
     MessageKind,
     decoder_of,
+    every_field,
+    options_for,
     packed_image,
     stamp_of,
     stated_format,
@@ -68,10 +71,11 @@ def choose_topics(
     readable: dict[str, dict[MessageKind, tuple[MessageKind, list[Channel]]]] = {}
     unreadable: dict[str, str] = {}
     for topic, kind, channel in channels:
-        if decoder_of(kind, options) is None:
+        how = options_for(topic, kind, options)
+        if decoder_of(kind, how) is None:
             unreadable[topic] = f"{kind.schema} in {kind.encoding or 'no encoding'}"
         else:
-            alike = kind if options.fields else MessageKind(kind.schema, kind.encoding)
+            alike = kind if how.fields else MessageKind(kind.schema, kind.encoding)
             kinds = readable.setdefault(topic, {})
             kinds.setdefault(alike, (kind, []))[1].append(channel)
     topics = options.topics
@@ -129,6 +133,17 @@ def message_stream(
         UsageError: there is no message, or no header if `options.stamp` asks for it.
         LogDamagedError: a message cannot be read.
     """
+    options = options_for(topic, kind, options)
+    warnings = list(about.pop("warnings", ()))
+    if options.fields == EVERY:
+        try:
+            fields = every_field(kind, fetch(0)) if len(times) else EVERY
+        except (MalformedRecord, MalformedImage) as error:
+            raise LogDamagedError(f"{path}: {topic}: {error}") from None
+        options = replace(options, fields=fields)
+        if not options.fields:
+            raise UsageError(f"{path}: {topic} has {kind.schema}, with neither images nor numbers")
+        warnings.append(f"{path}: {topic} is read as its numbers {', '.join(options.fields)}")
     decode = decoder_of(kind, options)
     assert decode is not None
     names = kind.schema, kind.encoding
@@ -145,6 +160,7 @@ def message_stream(
         pixel_format=partial(stated_format, *names),
         recipe=NUMBERS_RECIPE if options.fields else RECIPE,
         fields=options.fields,
+        warnings=warnings,
         **about,
     )
     if isinstance(decode, VideoPackets):

@@ -31,7 +31,7 @@ _SMALLEST: Final = 64
 SCENE_KEYS: Final = ("scene", "seed", "config_sha256")
 
 # Keys that are the same in all files of a recording.
-_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", *SCENE_KEYS)
+_SAME: Final = ("truth", "fps", "start_ns", *SCENE_KEYS)
 
 
 class SeveralRecordingsError(UsageError):
