@@ -170,6 +170,13 @@ def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
 
 
+def column_names(field: str, count: int) -> list[str]:
+    """Return a name for each number of a field: `x`, or `position[0]` and following."""
+    whole = re.fullmatch(r"(.*)\[(\d*):\d*\]", field)
+    name, start = (whole[1], int(whole[2] or 0)) if whole else (field, 0)
+    return [field] if count == 1 and not whole else [f"{name}[{start + i}]" for i in range(count)]
+
+
 def members(value: Any) -> list[str]:
     """Return the names of a decoded message's fields, whatever library decoded it; else []."""
     if isinstance(value, Mapping):

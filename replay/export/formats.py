@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +13,7 @@ from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_existing, refuse_taken
 from replay.export.frames import write_images, write_video, write_videos
 from replay.export.lerobot import write_dataset
-from replay.export.tables import TABLES
+from replay.export.tables import NUMBERS, TABLES, write_streams
 from replay.logs.source import LoggedSource
 from replay.open_sources import Announce, holds_run, is_recording, open_for_viewing
 
@@ -20,7 +21,7 @@ from replay.open_sources import Announce, holds_run, is_recording, open_for_view
 FORMS: Final = (*TABLES, "images", "mp4", "lerobot")
 
 # Endings of exported files: `force` replaces a folder only if it holds no others.
-WRITTEN: Final = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
+WRITTEN: Final = frozenset({".png", ".mp4", ".parquet", ".csv", ".json", ".md"})
 
 
 def export(
@@ -33,22 +34,25 @@ def export(
     inputs: InputOptions | None = None,
     task: str | None = None,
     about: Announce = lambda source: None,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> int:
-    """Write a run's signals, or the frames of a recording or of other logs, in another form.
+    """Write a run's signals, or the frames or numbers of logs, in another form.
 
     Args:
-        path: a run for a table; a recording or logs for the other forms. Several folders of
-            recordings become episodes of one LeRobot dataset.
-        out: file of a table or of the video of one stream, *.mp4; folder of the other forms.
+        path: a run, or logs of numbers, for a table; a recording or logs for the other forms.
+            Several folders of recordings become episodes of one LeRobot dataset.
+        out: file of a table or of the video of one stream, *.mp4; folder of the other forms, and
+            for the tables or videos of several streams.
         form: one of `FORMS`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images in a video.
         inputs: options of logs; by default all streams of images.
         task: description of the task of a LeRobot dataset; by default that of the log.
-        about: called with the opened recording or logs.
+        about: called with the opened recording or logs, of images or for a LeRobot dataset.
+        warn: called with each warning that `about` does not state.
 
     Returns:
-        The number of iterations, images or frames written.
+        The number of iterations, messages, images or frames written.
 
     Raises:
         UsageError: there is no such run, log or form; `out` exists and `force` is not set, or it
@@ -59,16 +63,13 @@ def export(
     paths = [path] if isinstance(path, Path) else list(path)
     if form not in FORMS:
         raise UsageError(f"--to {form!r} is not a format: {did_you_mean(form, FORMS)}")
-    if form in TABLES:
-        refuse_taken(out, force=force)
-        if len(paths) > 1 or not holds_run(paths[0]):
-            raise UsageError(
-                f"{form} is a format for the signals of one run: give one run, or use --to images, "
-                "--to mp4 or --to lerobot for frames"
-            )
-        with atomic_write(out) as place:
-            return TABLES[form](paths[0], place)
-    single = form == "mp4" and out.suffix == ".mp4"
+    is_of_run = form in TABLES and holds_run(paths[0])
+    if form in TABLES and (len(paths) > 1 if is_of_run else form not in NUMBERS):
+        raise UsageError(
+            f"{form} is a format for the signals of one run: give one run, or use --to parquet for "
+            "numbers of logs, and --to images, --to mp4 or --to lerobot for frames"
+        )
+    single = is_of_run or (form in ("mp4", *NUMBERS) and out.suffix == f".{form}")
     if single:
         refuse_taken(out, force=force)
     else:
@@ -77,20 +78,33 @@ def export(
             if not file.is_dir() and file.suffix not in WRITTEN:
                 other = f"{out} has files that no export wrote, as {file.relative_to(out)}"
                 raise UsageError(f"{other}: choose a new folder")
-    logs = _opened(paths, form, inputs, about, single=single)
+    if is_of_run:
+        with atomic_write(out) as place:
+            return TABLES[form](paths[0], place)
+    if form in NUMBERS:  # each row keeps its time
+        inputs = replace(inputs or InputOptions(), align="time")
+    logs = _opened(paths, form, inputs, about, warn, single=single)
     with contextlib.closing(logs), atomic_write(out) as place:
         if form == "lerobot":
             return write_dataset(logs, place, lossless=lossless, task=task)
         source = next(logs)
         if form == "images":
             return write_images(source, place)
+        if form in NUMBERS:
+            return write_streams(source, place, form, single=single)
         if single:
             return write_video(source, 0, place, lossless=lossless)
         return write_videos(source, place, lossless=lossless)
 
 
 def _opened(
-    paths: list[Path], form: str, inputs: InputOptions | None, about: Announce, *, single: bool
+    paths: list[Path],
+    form: str,
+    inputs: InputOptions | None,
+    about: Announce,
+    warn: Callable[[str], None],
+    *,
+    single: bool,
 ) -> Generator[LoggedSource]:
     """Yield each log, open until the next one.
 
@@ -105,16 +119,24 @@ def _opened(
         with contextlib.closing(open_for_viewing(log, inputs)) as source:
             spec, why = source.spec, ""
             first = first or spec
-            if form != "lerobot" and not spec.images:
-                why = "has no images: its frames are numbers; use --to lerobot"
-                if spec.kinds:
-                    why = "has streams of numbers: use --to lerobot"
+            if form not in ("lerobot", *NUMBERS) and not spec.images:
+                why = "has streams of numbers: use --to parquet or --to lerobot"
             elif single and len(spec.streams) > 1:
-                why = f"has {len(spec.streams)} streams: choose a folder instead of one .mp4 file"
+                why = (
+                    f"has {len(spec.streams)} streams: choose a folder instead of one .{form} file"
+                )
             for name in ("streams", "frame_shape", "dtype", "truth", "fps"):
                 if (a := getattr(first, name)) != (b := getattr(spec, name)):
                     why = f"has {name} {b}, but {paths[0]} has {a}: export them separately"
             if why:
                 raise UsageError(f"{log[0]} {why}")
-            about(source)
-            yield source
+            if form in NUMBERS:
+                for line in dict.fromkeys(w for stream in source.streams for w in stream.warnings):
+                    warn(line)
+            else:
+                about(source)
+            try:
+                yield source
+            finally:
+                for line in (*source.changes.values(), *source.skipped_damage()):
+                    warn(line)

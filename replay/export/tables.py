@@ -1,4 +1,6 @@
-"""A run's signals as a table for other programs: a row an iteration, a column a signal.
+"""A run's signals, or the numbers of a log, as a table for other programs.
+
+Signals have a row an iteration and a column a signal, numbers of a log a row a message.
 
 A missing value is null in Parquet, and NaN in npz and CSV. Parquet holds symbol, equation, unit
 and dimensions of each signal in the metadata of its column, and the configuration of the run in
@@ -14,14 +16,19 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pyarrow.csv import CSVWriter
 
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, Signal
+from recorder.images.fields import column_names
+from replay.export.applied import ROWS
+from replay.logs.source import LoggedSource
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
 
@@ -88,6 +95,44 @@ TABLES: dict[str, Callable[[Path, Path], int]] = {
     "parquet": write_parquet,
     "npz": write_npz,
 }
+
+
+# Forms in which the numbers of a log are written.
+NUMBERS: Final = ("parquet", "csv")
+
+
+def write_streams(source: LoggedSource, place: Path, form: str, *, single: bool) -> int:
+    """Write each stream of numbers as a table, and return the number of rows.
+
+    A row is a message, with its log time and a column for each number; of a recording, a frame.
+
+    Raises:
+        UsageError: a stream has images, messages of different length, or two columns of one name.
+        LogDamagedError: a message cannot be read.
+    """
+    count = 0
+    if not single:
+        place.mkdir()
+    for i, (name, log) in enumerate(zip(source.spec.streams, source.streams, strict=True)):
+        messages = source.messages(i, ROWS)
+        _, first = piece = next(messages)
+        names = log.columns() or column_names(name, first[0].size)
+        if (
+            first.ndim > 2
+            or len(names) != first.shape[1]
+            or len({"log_time", *names}) <= len(names)
+        ):
+            what = "images" if first.ndim > 2 else f"columns {', '.join(names)}"
+            raise UsageError(f"{log.path}: {name} has {what}: choose numbers with --field")
+        kinds = {"log_time": pa.int64(), **dict.fromkeys(names, pa.float64())}
+        out, schema = place if single else place / f"{name}.{form}", pa.schema(kinds)
+        writer = pq.ParquetWriter if form == "parquet" else CSVWriter
+        with writer(out, schema) as file:
+            for times, numbers in chain([piece], messages):
+                columns = list(map(pa.array, (times, *numbers.T)))
+                file.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+                count += len(times)
+    return count
 
 
 def signals_table(run: Path, names: Sequence[str]) -> pa.Table:

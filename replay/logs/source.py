@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import parse_json
@@ -178,6 +178,17 @@ class LoggedSource(StoredSource):
         for i, row in enumerate(rows if isinstance(rows, range) else rows.tolist()):
             frames[i] = self._frame(stream, row)
         return frames, np.empty((len(rows), 0))
+
+    def messages(self, stream: int, n: int) -> Iterator[tuple[IntArray, NDArray[Any]]]:
+        """Yield log times and content of all messages of a stream, n at a time; or all frames."""
+        log, first = self.streams[stream], self.first_frame
+        if log.times is None:
+            for block in self.pieces(stream, first, first + self.frames, n):
+                yield self.spec.times(block.t, block.t + len(block)), block.frames
+            return
+        for start in range(0, log.count, n):
+            rows = range(start, min(start + n, log.count))
+            yield log.times[start : rows.stop], self._frames(stream, first, rows)[0]
 
     def _expect(self, stream: int, t: int, rows: Rows) -> None:
         """Decode ahead the rows from frame t on, and those that are probably requested next.

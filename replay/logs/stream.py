@@ -65,7 +65,8 @@ class LogStream:
         pixel_format: returns the pixel format that a message states; None if it states none.
         encoding: encoding of its images in formats without messages.
         recipe: text that states how an image becomes a frame, stored with runs.
-        fields: names of the numbers that are read instead of images, in order.
+        fields: fields that are read instead of images, in order.
+        columns: returns the name of each number of a row.
         warnings: lines to print for the user.
         remarks: a line for each property that the format cannot guarantee, as without checksums.
         missing: the missing part of a truncated file, or "".
@@ -91,6 +92,7 @@ class LogStream:
     encoding: str = ""
     recipe: str = RECIPE
     fields: Sequence[str] = ()
+    columns: Callable[[], Sequence[str]] = tuple
     warnings: Sequence[str] = ()
     remarks: Sequence[str] = ()
     missing: str = ""

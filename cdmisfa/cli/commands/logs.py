@@ -19,6 +19,7 @@ from cdmisfa.core.names import counted, duration_text
 if TYPE_CHECKING:
     from replay.corpus.index import Indexed
     from replay.integrity.report import LogReport, SizeInfo
+    from replay.logs.source import LoggedSource
     from replay.logs.stream import ChannelInfo
 
 # Largest number of streams of a run that `info` names, to keep them on one line.
@@ -243,12 +244,13 @@ def export_command(
     as_json: bool,
     **arguments: Any,
 ) -> None:
-    """Export signals as a table, or images as PNG, MP4 or LeRobot.
+    """Export signals or numbers as a table, or images as PNG, MP4 or LeRobot.
 
     The signals of a run (the values that the learner computed) go to one Parquet, CSV or NumPy
-    file; CSV leaves out the outputs of single frames (y, y_frozen). Recordings and logs go to a
-    folder of PNG files, to one MP4 file for each stream, or to a LeRobot dataset v3.0, in which
-    each recording is an episode.
+    file; CSV leaves out the outputs of single frames (y, y_frozen). The numbers of logs (--field)
+    go to one Parquet or CSV file for each stream, with a row for each message: log_time (ns) and
+    the fields. Recordings and logs go to a folder of PNG files, to one MP4 file for each stream,
+    or to a LeRobot dataset v3.0, in which each recording is an episode.
 
     PATH is one of:
         {run}
@@ -267,23 +269,39 @@ def export_command(
 
     Examples:
         cdmisfa export runs/kitchen -o signals.parquet
+        cdmisfa export robot.mcap --topic /joint_states --field position -o joints.parquet
         cdmisfa export recordings/kitchen --to mp4 -o films
         cdmisfa export monday.mcap tuesday.mcap --to lerobot --lossless -o dataset
     """
     from replay.export.formats import export
     from replay.export.tables import CSV_LEAVES_OUT, TABLES
+    from replay.open_sources import holds_run
 
     form = form or output.suffix.removeprefix(".")
-    rows = export(path, output, form, lossless=lossless, about=printing.source, **arguments)
-    if form == "csv":
+    warnings: list[str] = []
+
+    def warn(text: str) -> None:
+        printing.warning(text)
+        warnings.append(text)
+
+    def about(source: LoggedSource) -> None:
+        printing.source(source)
+        warnings.extend(source.warnings)
+
+    rows = export(path, output, form, lossless=lossless, about=about, warn=warn, **arguments)
+    of_run = form in TABLES and holds_run(path[0])
+    if form == "csv" and of_run:
         printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz have them")
     videos = output.is_file() or next(output.rglob("*.mp4"), None) is not None
     if form in ("mp4", "lerobot") and videos and not lossless:
         printing.status("H.264 changes pixels a little: --lossless keeps every pixel")
     if as_json:
-        printing.document(path=" ".join(map(str, path)), file=str(output), rows=rows)
+        printing.document(
+            path=" ".join(map(str, path)), file=str(output), rows=rows, warnings=warnings
+        )
         return
-    unit = "iterations" if form in TABLES else "images" if form == "images" else "frames"
+    unit = "iterations" if of_run else "messages" if form in TABLES else "frames"
+    unit = "images" if form == "images" else unit
     printing.line(f"{rows} {unit} written to {output}")
 
 

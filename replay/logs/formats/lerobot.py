@@ -5,6 +5,7 @@ The layout is read as it is published (github.com/huggingface/lerobot), with PyA
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -18,6 +19,7 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, check_regular, read_json
 from recorder.images.compressed import compressed_image
+from recorder.images.fields import column_names
 from recorder.images.options import RECIPE, VIDEO_RECIPE, InputOptions
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic
@@ -201,7 +203,10 @@ def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptio
     stream = number_stream(
         path, topic, {what: frames}, dataset.times, options, lambda row: f"{path}: frame {row}"
     )
-    return replace(stream, fields=names, warnings=[*stream.warnings, *dataset.notes(what)])
+    widths = {name: math.prod(dataset.info["features"][name].get("shape", ())) for name in names}
+    columns = [column for name in names for column in column_names(name, widths[name])]
+    stream = replace(stream, fields=names, columns=lambda: columns)
+    return replace(stream, warnings=[*stream.warnings, *dataset.notes(what)])
 
 
 def is_dataset(path: Path) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.fields import EVERY
+from recorder.images.fields import EVERY, column_names
 from recorder.images.messages import (
     PACKED,
     SCHEMAS,
@@ -146,6 +146,14 @@ def message_stream(
         warnings.append(f"{path}: {topic} is read as its numbers {', '.join(options.fields)}")
     decode = decoder_of(kind, options)
     assert decode is not None
+
+    def columns() -> list[str]:
+        message, numbers = fetch(0), list[str]()
+        for field in options.fields:
+            read = decoder_of(kind, replace(options, fields=(field,)))
+            numbers += column_names(field, len(read(message))) if read else []
+        return numbers
+
     names = kind.schema, kind.encoding
     is_packed = names in PACKED and not options.fields
     stream = LogStream(
@@ -161,6 +169,7 @@ def message_stream(
         recipe=NUMBERS_RECIPE if options.fields else RECIPE,
         fields=options.fields,
         warnings=warnings,
+        columns=columns,
         **about,
     )
     if isinstance(decode, VideoPackets):

@@ -15,7 +15,7 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import check_regular
-from recorder.images.fields import EXACT, Field, bounded, is_path
+from recorder.images.fields import EXACT, Field, bounded, column_names, is_path
 from recorder.images.options import NUMBERS_RECIPE, InputOptions
 from replay.logs.formats.messages import check_topics
 from replay.logs.stream import LAST_NS, ChannelInfo, ExternalChannel, LogStream, limited, picked
@@ -167,6 +167,7 @@ def number_stream(
         where=lambda row: where(int(rows[row])),
         recipe=NUMBERS_RECIPE,
         fields=tuple(columns),
+        columns=lambda: [n for name, x in columns.items() for n in column_names(name, x.shape[1])],
         warnings=[f"{path}: {line}" for line in lines],
     )
 
