@@ -1,4 +1,4 @@
-"""A run's signals as Parquet, npz and CSV hold the numbers of its log and their metadata."""
+"""Signals of a run and numbers of logs as tables, with every number of the log."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import csv
 import json
 
 import numpy as np
+import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
+from camera_files import pictures, write_images
+from message_files import write_mcap
 from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
+from recorder.images.messages import MessageKind
 from replay.export.formats import export
+from replay.open_sources import open_recording
 
 
 @pytest.fixture
@@ -83,3 +88,71 @@ def test_an_existing_file_is_replaced_only_by_force(run):
         export([folder, folder], folder / "two.csv", "csv")
     assert (folder / "run.csv").read_text() == "mine"
     assert export(folder, folder / "run.csv", "csv", force=True) == 20
+
+
+JOINTS = MessageKind("JointState", "json")
+
+
+def joint_log(path, topics=("/joints",), count=9000):
+    """A log with uneven times, each topic with half the messages of the one before."""
+    times = 10**18 + np.cumsum(np.random.default_rng(0).integers(1, 10**8, count))
+    rows = [{"position": [i / 7, -i], "velocity": [i % 3], "effort": []} for i in range(count)]
+    messages = [(int(t), json.dumps(row).encode()) for t, row in zip(times, rows, strict=True)]
+    write_mcap(path, JOINTS, {name: messages[:: 2**i] for i, name in enumerate(topics)})
+    return times, np.array([[*row["position"], *row["velocity"]] for row in rows])
+
+
+@pytest.mark.parametrize("form", ["parquet", "csv"])
+def test_numbers_of_a_topic_are_a_row_a_message_at_its_time(tmp_path, cdmisfa, form):
+    times, numbers = joint_log(tmp_path / "log.mcap")
+    out = tmp_path / f"joints.{form}"
+    words = ("--topic", "/joints", "--field", "position", "--field", "velocity[0:]")
+    assert (
+        cdmisfa("export", tmp_path / "log.mcap", *words, "-o", out, "--json").json["rows"] == 9000
+    )
+    table = pq.read_table(out) if form == "parquet" else pyarrow.csv.read_csv(out)
+    assert table.column_names == ["log_time", "position[0]", "position[1]", "velocity[0]"]
+    np.testing.assert_array_equal(table["log_time"], times)
+    np.testing.assert_array_equal(np.transpose(table.columns[1:]), numbers)
+    timed = ("--set", "input.time=log_time:ns", "-o", tmp_path / "again.csv")
+    assert cdmisfa("export", out, *timed).code == 0
+    again = pyarrow.csv.read_csv(tmp_path / "again.csv")
+    assert again.to_pydict() == table.to_pydict()
+
+
+def test_several_topics_and_recordings_of_numbers_are_a_table_a_stream(tmp_path, cdmisfa):
+    log, rec = tmp_path / "log.mcap", tmp_path / "rec"
+    times, numbers = joint_log(log, ("/a", "/b"), 60)
+    assert (
+        "choose a folder"
+        in cdmisfa("export", log, "--topic", "/a", "--topic", "/b", "-o", tmp_path / "x.csv").err
+    )
+    done = cdmisfa("export", log, "--topic", "/a", "--topic", "/b", "--to", "parquet", "-o", rec)
+    assert "read as its numbers position, velocity" in done.err
+    for i, name in enumerate("ab"):
+        table = pq.read_table(rec / f"{name}.parquet")
+        np.testing.assert_array_equal(table["log_time"], times[:: 2**i])
+        np.testing.assert_array_equal(np.transpose(table.columns[1:]), numbers[:: 2**i])
+    how = ("--topic", "/a", "--field", "position", "--align", "time", "--rate", "10")
+    assert cdmisfa("convert", log, *how, "-o", rec, "--force").code == 0
+    assert cdmisfa("export", rec, "-o", tmp_path / "rec.parquet").code == 0
+    with open_recording(rec) as source:
+        frames = source.take(0, source.frames)
+        assert pq.read_table(tmp_path / "rec.parquet").to_pydict() == {
+            "log_time": source.spec.times(0, source.frames).tolist(),
+            **{f"a[{i}]": frames.frames[:, i].tolist() for i in range(2)},
+        }
+
+
+def test_a_table_says_what_it_rounds_and_refuses_what_has_no_columns(tmp_path, cdmisfa):
+    values = [{"n": 2**53 + i, "list": [1] * (1 + i % 2)} for i in range(4)]
+    messages = [(10**18 + i * 10**7, json.dumps(row).encode()) for i, row in enumerate(values)]
+    write_mcap(tmp_path / "n.mcap", JOINTS, {"/n": messages})
+    export_ = ("export", tmp_path / "n.mcap", "-o", tmp_path / "n.parquet", "--field")
+    (line,) = cdmisfa(*export_, "n", "--json").json["warnings"]
+    assert line.endswith("numbers beyond 2^53 are rounded to float64")
+    refused = cdmisfa(*export_, "list", "--force")
+    assert (refused.code, "has 2 numbers, but the first had 1" in refused.err) == (2, True)
+    write_images(tmp_path / "cam.mcap", {"/cam": [(i * 20, x) for i, x in enumerate(pictures(5))]})
+    refused = cdmisfa("export", tmp_path / "cam.mcap", "-o", tmp_path / "c.csv")
+    assert "cam has images: choose numbers with --field" in refused.err
