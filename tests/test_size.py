@@ -13,7 +13,7 @@ from sources import PRODUCT, ROOT, files, name, tree
 CEILINGS = {
     "benchmarks": 3060,
     "cdmisfa": 300,
-    "cdmisfa/agents": 1185,
+    "cdmisfa/agents": 1195,
     "cdmisfa/cli": 2160,
     "cdmisfa/core": 1140,
     "cdmisfa/estimators": 245,
@@ -37,7 +37,7 @@ CEILINGS = {
     "replay/runs": 1410,
     "replay/storage": 290,
     "replay/view": 1960,
-    "tests": 18600,
+    "tests": 19000,
     "tools": 2080,
 }
 """Code lines allowed in each package: what it had when the ceiling was set, and 5 percent."""

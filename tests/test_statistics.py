@@ -58,3 +58,20 @@ def test_the_interval_of_a_mean_contains_it_in_95_percent_of_samples() -> None:
         assert inside.mean() == pytest.approx(0.95, abs=0.012)
     assert statistics.mean_interval([5.0, math.nan]) == (-math.inf, math.inf)
     assert statistics.mean_interval([1.0, 1.0]) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("n", "t"),  # Student's t at 97.5 %, published tables
+    [
+        *((2, 12.7062), (3, 4.3027), (4, 3.1824), (5, 2.7764), (6, 2.5706), (10, 2.2622)),
+        *((20, 2.0930), (30, 2.0452), (31, 2.0423), (41, 2.0211), (61, 2.0003), (100, 1.9842)),
+    ],
+)
+def test_quantiles_of_student_are_those_of_published_tables(n: int, t: float) -> None:
+    assert statistics.student(n - 1) == pytest.approx(t, abs=5.1e-5)
+
+
+def test_quantiles_of_student_fall_to_that_of_the_normal_distribution() -> None:
+    quantiles = [statistics.student(freedom) for freedom in (*range(1, 101), 10_001, 999_999)]
+    assert all(np.diff(quantiles) < 0)
+    assert quantiles[-1] == pytest.approx(statistics.NORMAL_95, abs=3e-6)

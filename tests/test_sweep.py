@@ -6,6 +6,7 @@ import contextlib
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import threading
@@ -272,6 +273,11 @@ def test_means_and_deviations_are_over_finished_seeds(known: Path) -> None:
     assert one.measures["eta_1"].n == 2
     assert one.measures["eta_1"].mean == 0.25
     assert dict(one.orders) == {"x1": 2, "": 1}
+    # Student with 2 degrees of freedom, and Wilson's interval of 2 of 3.
+    half = 4.302653 * 10 / 3**0.5
+    assert one.measures["iterations"].interval == pytest.approx((20 - half, 20 + half), abs=1e-5)
+    assert one.shares["x1"] == pytest.approx((0.2077, 0.9385), abs=1e-4)
+    assert two.measures["iterations"].interval is None
     assert (two.done, two.missing) == (1, 1)
     assert "eta_1" not in two.measures
 
@@ -286,8 +292,14 @@ def test_results_are_printed_in_every_form(cdmisfa: Cdmisfa, known: Path) -> Non
     assert (first["learner.nu"], float(first["iterations_sd"])) == ("1", 10.0)
     assert (second["iterations_sd"], second["eta_1_mean"]) == ("", "")
     document = json.loads(shown("--json"))
-    assert document["points"][1]["measures"]["iterations"] == {"mean": 5.0, "sd": None, "n": 1}
-    assert "20 ± 10" in shown() == shown("--quiet")
+    only = {"mean": 5.0, "sd": None, "n": 1, "interval": None}
+    assert document["points"][1]["measures"]["iterations"] == only
+    assert (first["iterations_low"][:5], second["iterations_high"]) == ("-4.84", "")
+    assert (first["order_low"][:6], first["order_high"][:6]) == ("0.2076", "0.9385")
+    head, _, *rows = (re.split(r" {2,}", line) for line in shown("--quiet").splitlines())
+    assert head[5:7] == ["iterations ± SD", "95 %"]
+    assert rows[0][5:7] == ["20 ± 10", "-4.841 .. 44.84"]
+    assert rows[1][5:7] == ["5", "-"]
 
 
 # The command

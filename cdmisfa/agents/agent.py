@@ -147,18 +147,25 @@ def as_struct(agent: Agent, rules: SimpleNamespace, out: NDArray[np.void]) -> ke
         rules: see `rules`.
         out: (1,) of `OUTCOME`, written by the kernels.
     """
-    sizes = {
-        "streams": len(agent.policy),
-        "outputs": len(agent.eta),
-        "tau": agent.centres.shape[2],
-        "tensor": len(agent.dense),
-        "places": agent.counts.shape[1],
+    S, J, tau, dense = len(agent.policy), len(agent.eta), agent.centres.shape[2], len(agent.dense)
+    labels, places = agent.counts.shape
+    kernels.expect_some(streams=S, outputs=J, tau=tau)
+    kernels.expect("dense and labels", dense in (0, S) and labels in (0, S), True)
+    kernels.expect("memory and out", (agent.memory.shape, out.shape), ((1,), (1,)))
+    sizes = {"streams": S, "outputs": J, "tau": tau, "tensor": dense, "places": places}
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(("stay_sum", "switch_sum", "policy"), (S,)),
+        "y_frames": (1,),
+        "dense": (dense, 2, dense),
+        "centres": (labels, places, tau, J),
+        "counts": (labels, places),
     }
     numbers = kernels.Struct("rules", vars(rules), {})
     arrays = {"rules": numbers.pointer, "out": kernels.records("outcome", out)}
     arrays["memory"] = kernels.records("memory", agent.memory)
     for name, array in zip(agent._fields[1:], agent[1:], strict=True):
-        arrays[name] = kernels.pointer(name, array, array.shape, array.dtype)
+        kind = kernels.INT64 if name in ("y_frames", "policy") else kernels.FLOAT64
+        arrays[name] = kernels.pointer(name, array, shapes.get(name, (J,)), kind)
     return kernels.Struct("agent", sizes, arrays)
 
 

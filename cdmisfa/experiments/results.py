@@ -1,4 +1,4 @@
-"""Results of a sweep: mean and standard deviation over seeds at each point of its grid."""
+"""Results of a sweep: mean, standard deviation and 95 % interval at each point of its grid."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,6 @@ CHI_SQUARE_95 = 3.841458820694124
 # 97.5 % quantile of the normal distribution: 95 % of its values are within this of the mean.
 NORMAL_95 = 1.959963984540054
 
-# 97.5 % quantiles of Student's t distribution, for 1 to 30 degrees of freedom.
-STUDENT_95 = (
-    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
-    2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
-    2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
-)  # fmt: skip
-
 # Range of the slope of a logistic fit, divided by the range of x. Set by hand, far beyond the
 # slopes of the trials: a step is steepest, a line across the range is flattest.
 MAX_SLOPE = 1e4
@@ -41,25 +35,55 @@ MIN_SLOPE = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class MeanSd:
-    """Mean and standard deviation (n - 1) of n values; NaN if there are too few values."""
+    """Mean and standard deviation (n - 1) of n values; NaN if there are too few values.
+
+    `interval` is the 95 % interval of the mean (Student); None for fewer than two values.
+    """
 
     mean: float
     sd: float
     n: int
+    interval: tuple[float, float] | None = None
 
 
 def summary(values: ArrayLike) -> MeanSd:
-    """Return mean and standard deviation of the values that are finite.
+    """Return mean, standard deviation and interval of the values that are finite.
 
     Example:
-        >>> summary([1.0, 3.0, float("nan")])
-        MeanSd(mean=2.0, sd=1.4142135623730951, n=2)
+        >>> result = summary([1.0, 3.0, float("nan")])
+        >>> result.mean, round(result.sd, 3), [round(bound, 3) for bound in result.interval]
+        (2.0, 1.414, [-10.706, 14.706])
     """
     x = np.asarray(values, dtype=float).ravel()
     x = x[np.isfinite(x)]
-    if not len(x):
-        return MeanSd(math.nan, math.nan, 0)
-    return MeanSd(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else math.nan, len(x))
+    if len(x) < 2:
+        return MeanSd(float(x[0]) if len(x) else math.nan, math.nan, len(x))
+    mean, sd = float(x.mean()), float(x.std(ddof=1))
+    half = student(len(x) - 1) * sd / math.sqrt(len(x))
+    return MeanSd(mean, sd, len(x), (mean - half, mean + half))
+
+
+@cache
+def student(freedom: int) -> float:
+    """Return the 97.5 % quantile of Student's t distribution with some degrees of freedom.
+
+    It inverts the finite series of the probability that |t| is below tan(angle) sqrt(freedom)
+    (Abramowitz and Stegun, 26.7.3 and 26.7.4).
+
+    Example:
+        >>> [round(student(freedom), 3) for freedom in (1, 2, 10)]
+        [12.706, 4.303, 2.228]
+    """
+    odd = freedom % 2
+    k = np.arange(2 + odd, freedom, 2)
+    low, high = 0.0, math.pi / 2
+    while low < (angle := (low + high) / 2) < high:
+        sine, cosine = math.sin(angle), math.cos(angle)
+        series = 1 + float(np.cumprod((k - 1) / k * cosine**2).sum())
+        wave = sine * (cosine if odd else 1) * series * (freedom > 1)
+        inside = (angle + wave) * 2 / math.pi if odd else wave
+        low, high = (angle, high) if inside < 0.95 else (low, angle)
+    return math.tan(low) * math.sqrt(freedom)
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:
@@ -84,15 +108,7 @@ def mean_interval(values: ArrayLike) -> tuple[float, float]:
         >>> [round(bound, 2) for bound in mean_interval([1.0, 2.0, 3.0])]
         [-0.48, 4.48]
     """
-    sample = summary(values)
-    if sample.n < 2:
-        return -math.inf, math.inf
-    freedom = sample.n - 1
-    # First terms of the expansion of the quantile for many degrees of freedom.
-    approximate = NORMAL_95 + (NORMAL_95**3 + NORMAL_95) / (4 * freedom)
-    t = STUDENT_95[freedom - 1] if freedom <= len(STUDENT_95) else approximate
-    half = t * sample.sd / math.sqrt(sample.n)
-    return sample.mean - half, sample.mean + half
+    return summary(values).interval or (-math.inf, math.inf)
 
 
 def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> float:
@@ -169,8 +185,9 @@ class PointResult:
         done: number of finished trials, which the measures describe.
         failed: number of failed trials.
         missing: number of trials that were not computed yet.
-        measures: mean and standard deviation over the finished trials, by name.
+        measures: mean, standard deviation and interval over the finished trials, by name.
         orders: number of trials that learned the streams in each order, the most frequent first.
+        shares: 95 % interval of the share of the finished trials with each order (Wilson).
     """
 
     point: Mapping[str, Any]
@@ -180,6 +197,7 @@ class PointResult:
     missing: int
     measures: Mapping[str, MeanSd]
     orders: Mapping[str, int]
+    shares: Mapping[str, tuple[float, float]]
 
 
 def results(folder: str | Path) -> list[PointResult]:
@@ -217,7 +235,8 @@ def _point(point: Mapping[str, Any], rows: Sequence[Mapping[str, Any] | None]) -
     orders = Counter(" ".join(m["stream"] for m in r["modules"]) for r in finished)
     failed = sum(row is not None and row["status"] == FAILED for row in rows)
     counts = len(rows), len(finished), failed, rows.count(None)
-    return PointResult(point, *counts, measures, dict(orders.most_common()))
+    shares = {order: wilson(count, len(finished)) for order, count in orders.most_common()}
+    return PointResult(point, *counts, measures, dict(orders.most_common()), shares)
 
 
 def varied(points: Sequence[PointResult]) -> dict[str, list[Any]]:
@@ -239,36 +258,43 @@ def _measures(points: Sequence[PointResult]) -> dict[str, list[MeanSd]]:
 
 
 def as_csv(points: Sequence[PointResult]) -> str:
-    """Return a CSV table: a line for each point, and two columns for each measure."""
+    """Return a CSV table: a line for each point, and four columns for each measure."""
     measures, text = _measures(points), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    columns = [f"{name}_{part}" for name in measures for part in ("mean", "sd")]
+    columns = [f"{name}_{part}" for name in measures for part in ("mean", "sd", "low", "high")]
     keys = list(points[0].point) if points else []
-    writer.writerow([*keys, "trials", "done", "failed", *columns, "order", "order_count"])
+    order_columns = "order", "order_count", "order_low", "order_high"
+    writer.writerow([*keys, "trials", "done", "failed", *columns, *order_columns])
     for p, *at_point in zip(points, *measures.values(), strict=True):
-        numbers = [value for measure in at_point for value in (measure.mean, measure.sd)]
+        numbers = [v for m in at_point for v in (m.mean, m.sd, *(m.interval or (math.nan,) * 2))]
         cells = ["" if math.isnan(value) else repr(value) for value in numbers]
-        order = next(iter(p.orders.items()), ("", 0))
-        writer.writerow([*p.point.values(), p.trials, p.done, p.failed, *cells, *order])
+        order, count = next(iter(p.orders.items()), ("", 0))
+        row = [p.trials, p.done, p.failed, *cells, order, count, *p.shares.get(order, ("", ""))]
+        writer.writerow([*p.point.values(), *row])
     return text.getvalue()
 
 
 def as_table(points: Sequence[PointResult]) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of a table: mean ± SD, and the most frequent order with its count."""
+    """Return head and rows of a table: mean ± SD with its interval, and the most frequent order."""
     measures = _measures(points)
-    head = [*(points[0].point if points else ()), "done", "failed", *measures, "order"]
+    columns = [text for name in measures for text in (f"{name} ± SD", "95 %")]
+    head = [*(points[0].point if points else ()), "done", "failed", *columns, "order", "95 %"]
     rows = []
     for p, *at_point in zip(points, *measures.values(), strict=True):
         order, count = next(iter(p.orders.items()), ("", 0))
         share = f"{order} ({count}/{p.done})" if order else ""
-        cells = [_cell(measure) for measure in at_point]
-        done = f"{p.done}/{p.trials}"
-        rows.append([*map(str, p.point.values()), done, str(p.failed), *cells, share])
+        cells = [cell for measure in at_point for cell in _cells(measure)]
+        done, within = f"{p.done}/{p.trials}", _interval(p.shares.get(order) if order else None)
+        rows.append([*map(str, p.point.values()), done, str(p.failed), *cells, share, within])
     return head, rows
 
 
-def _cell(measure: MeanSd) -> str:
-    if not measure.n:
-        return ""
-    mean, sd = f"{measure.mean:.4g}", f" ± {measure.sd:.2g}"
-    return mean if math.isnan(measure.sd) else mean + sd
+def _cells(measure: MeanSd) -> tuple[str, str]:
+    """Return mean ± SD, and the interval of the mean."""
+    mean = f"{measure.mean:.4g}" if measure.n else ""
+    spread = f" ± {measure.sd:.2g}" if measure.n > 1 else ""
+    return mean + spread, _interval(measure.interval)
+
+
+def _interval(bounds: tuple[float, float] | None) -> str:
+    return " .. ".join(f"{bound:.4g}" for bound in bounds) if bounds else "-"

@@ -53,6 +53,17 @@ def expect(name: str, actual: object, expected: object) -> None:
         raise UsageError(f"{name} is {actual}: give {expected}")
 
 
+def expect_some(**sizes: int) -> None:
+    """Check that sizes are at least 1.
+
+    Raises:
+        UsageError: one is not.
+    """
+    for name, size in sizes.items():
+        if size < 1:
+            raise UsageError(f"{name} is {size}: give at least 1")
+
+
 def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
     """Return the address of an array for C to read and write; it keeps the array alive.
 
@@ -83,7 +94,12 @@ def readable(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
 
 
 def records(kind: str, array: NDArray[np.void]) -> Any:
-    """Return the address of an array of C records of a type."""
+    """Return the address of an array of C records of a type.
+
+    Raises:
+        UsageError: the records of the array have another size.
+    """
+    expect(f"{kind} (bytes)", array.dtype.itemsize, ffi.sizeof(kind))
     return _buffer(f"{kind}[]", array, True)
 
 
@@ -92,12 +108,13 @@ class Struct:
 
     Attributes:
         pointer: pointer to the record.
+        arrays: the addresses of its arrays.
     """
 
-    __slots__ = ("_arrays", "pointer")
+    __slots__ = ("arrays", "pointer")
 
     def __init__(self, kind: str, numbers: Mapping[str, float], arrays: Mapping[str, Any]) -> None:
-        self._arrays = arrays
+        self.arrays = arrays
         self.pointer = ffi.new(f"{kind} *", {**numbers, **arrays})
 
 
@@ -200,6 +217,7 @@ def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
 def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
     """Return incremental SFA as C takes it: the arrays of `IncSFAState`, and its constants."""
     (K, size), J = state.v.shape, len(state.w)
+    expect_some(inputs=size, components=K, outputs=J)
     shapes = {
         "mean": (size,),
         "v": (K, size),
@@ -230,8 +248,13 @@ def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update
 
 
 def instantaneous_slowness(y: Any) -> FloatArray:
-    """Return (J,) the slowness of each output (n, J) within a block."""
+    """Return (J,) the slowness of each output (n, J) within a block.
+
+    Raises:
+        UsageError: the block has no frames.
+    """
     n, J = np.shape(y)
+    expect_some(frames=n)
     eta = np.empty(J)
     lib.instantaneous_slowness(n, J, readable("y", y, (n, J)), _buffer("double[]", eta))
     return eta
@@ -308,12 +331,18 @@ def _expect_inputs(agent: Struct, frozen: Struct, feature: Struct, x: Struct) ->
     sizes = feature.pointer.inputs, feature.pointer.outputs
     expect("the abstraction", sizes, (x.pointer.size, agent.pointer.outputs))
     expect("frozen modules", frozen.pointer.inputs, x.pointer.size)
+    lengths = dict.fromkeys(("offset", "band_mean", "band_sd"), agent.pointer.outputs)
+    lengths["phi"] = agent.pointer.outputs * x.pointer.size
+    lengths |= {name: len(agent.arrays[name]) for name in ("centres", "counts")}
+    for name, length in lengths.items():
+        expect(f"frozen {name}", len(frozen.arrays[name]), frozen.pointer.modules * length)
 
 
 def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
     """Return a state of recursive SFA as C takes it; see `RecursiveState`."""
     (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
     components = len(arrays["spectrum"])
+    expect_some(inputs=inputs, size=size, components=components, outputs=outputs, window=window)
     shapes = {
         "mean": (inputs,),
         "basis": (size, inputs),

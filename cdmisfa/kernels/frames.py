@@ -11,7 +11,7 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import UsageError
-from cdmisfa.kernels import INT64, Struct, pointer, readable, records
+from cdmisfa.kernels import INT64, Struct, expect, pointer, readable, records
 
 # A message in a chunk: its times (ns), and offset (`at`) and size of its payload in bytes.
 MESSAGE = np.dtype(
@@ -61,6 +61,7 @@ def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> S
         width: size of a value (bytes).
     """
     m, r = len(marks), len(distances)
+    expect("width", width, max(width, 0))
     arrays = {
         "distances": readable("distances", distances, (r,), INT64),
         "places": readable("places", places, (m,), INT64),
@@ -96,6 +97,7 @@ def gather(
     shape = stop - start, expected.values * expected.width
     into = kernels.ffi.NULL if out is None else pointer("out", out, shape, UINT8)
     chunk = kernels.ffi.from_buffer("uint8_t[]", data), len(data)
+    expect("messages", messages.dtype, MESSAGE)
     table = kernels.ffi.from_buffer("message[]", messages), len(messages)
     count = int(kernels.lib.gather(*chunk, *table, channel, start, stop, expected, into))
     return None if count < 0 else count

@@ -75,8 +75,8 @@ def sweep_command(
             is tried.
         --seeds FIRST:END: Use each of these seeds: from FIRST to before END, or a list such as
             1,5,9.
-        --summary: Learn nothing; print mean and standard deviation over the seeds of the sweep in
-            the folder SOURCE.
+        --summary: Learn nothing; print mean, standard deviation (SD) and 95 % interval over the
+            seeds of the sweep in the folder SOURCE.
         --csv: Print the summary as comma-separated values.
 
     Examples:
@@ -178,7 +178,7 @@ def _folder_of_sweep(ctx: click.Context) -> Path:
 
 
 def _print_summary(folder: Path, *, as_csv: bool, as_json: bool) -> None:
-    """Print mean and standard deviation of the trials that the last sweep command asked for."""
+    """Print the statistics of the trials that the last sweep command asked for."""
     from cdmisfa.experiments import results
 
     points = results.results(folder)

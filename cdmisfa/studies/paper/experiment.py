@@ -41,7 +41,7 @@ class Findings:
 
     Attributes:
         lines: rows of the table: the measured quantity, the paper's value as text ("-" if it gives
-            none), mean, SD, number of trials, 95 % interval of a share, decimals to print.
+            none), mean, SD, number of trials, 95 % interval, decimals to print.
         tables: further tables, each with its head and rows of texts.
         claims: statements of the paper, and whether they are reproduced: true, false, or None if
             that cannot be decided.
@@ -57,8 +57,8 @@ class Findings:
     def measured(
         self, quantity: str, values: ArrayLike, paper: str = "-", *, digits: int = 3
     ) -> None:
-        """Add mean and SD of values to the table."""
-        line = {"quantity": quantity, "paper": paper, **asdict(summary(values)), "interval": None}
+        """Add mean, SD and 95 % interval of the mean of values to the table."""
+        line = {"quantity": quantity, "paper": paper, **asdict(summary(values))}
         self.lines.append({**line, "digits": digits})
 
     def share(self, quantity: str, paper: str, good: int, n: int) -> None:
