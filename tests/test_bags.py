@@ -15,13 +15,11 @@ import pytest
 from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
 from folders import external
-
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from replay.logs.open_logs import open_stream
-
-pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
+
+from cdmisfa.core.errors import LogDamagedError, MissingPackageError
+from replay.logs.open_logs import open_stream
 
 COUNT = 60
 TOPICS = ("/cam_left", "/cam_right")
@@ -104,12 +102,12 @@ def test_a_message_that_is_no_bytes_is_damage(tmp_path: Path, value: object) -> 
         images.image(0)
 
 
-def test_without_rosbags_the_extra_is_named(
+def test_without_rosbags_the_package_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = ros1_bag(tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
-    with pytest.raises(CdmisfaError, match=r"pip install 'cdmisfa\[ros\]'"):
+    with pytest.raises(MissingPackageError, match=r"rosbags \(pip install rosbags\)"):
         external(path, TOPICS)
 
 

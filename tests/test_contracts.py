@@ -65,10 +65,6 @@ def test_what_is_written_into_the_state_of_a_feature_restores_it(kind: type[Any]
 
 
 class TestVideo(CameraContract):
-    @pytest.fixture(autouse=True)
-    def _pyav(self) -> None:
-        pytest.importorskip("av")
-
     def open(self) -> Camera:
         return VideoCamera("av:lavfi:testsrc=rate=100:size=64x48", "bars")
 

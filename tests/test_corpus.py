@@ -19,7 +19,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.corpus import index as indexing
 from replay.corpus.index import index_logs, read_index
 from replay.corpus.index_rows import SCHEMA
-from replay.corpus.listing import INDEX, find_logs
+from replay.integrity.listing import INDEX, find_logs
 
 ROOT = Path(__file__).parents[1]
 
@@ -57,7 +57,7 @@ def row(folder: Path, path: str, topic: str | None = None) -> dict[str, Any]:
 class TestRows:
     def test_each_stream_is_a_row_of_what_its_summary_says(self, corpus: Path) -> None:
         made = index_logs([corpus])
-        assert (made.logs, made.read, made.kept, made.broken) == (10, 10, 0, 3)
+        assert (made.logs, made.files, made.read, made.kept, made.broken) == (8, 10, 10, 0, 3)
         view = row(corpus, "night/one/x1.mcap", "/view/x1")
         size = (corpus / "night" / "one" / "x1.mcap").stat().st_size
         assert view == {
@@ -147,7 +147,7 @@ class TestUpToDate:
         )
         made = index_logs([corpus])
         assert opened == [*(f"night/two/x{i}.mcap" for i in (1, 2, 3)), "robot.mcap"]
-        assert (made.read, made.kept, made.gone, made.logs) == (4, 8, ["text.mcap"], 12)
+        assert (made.read, made.kept, made.gone, made.files) == (4, 8, ["text.mcap"], 12)
 
 
 class TestBadInput:
@@ -179,7 +179,7 @@ class TestBadInput:
     ) -> None:
         monkeypatch.setattr(indexing, "BATCH", 4)
         made = index_logs([corpus], stop=lambda: True)
-        assert (made.stopped, made.read, made.logs) == (True, 4, 4)
+        assert (made.stopped, made.read, made.files) == (True, 4, 4)
         made = index_logs([corpus])
         assert (made.stopped, made.read, made.kept) == (False, 6, 4)
         index_logs([corpus], deep=True, stop=lambda: True)

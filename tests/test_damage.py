@@ -201,12 +201,10 @@ def damaged(logs: Path, folder: Path, format: str, damage: str) -> tuple[Path, P
     """A copy of a log with damage, and the file in it that has it."""
     name, inner = FORMATS[format]
     if format == "ROS 1" and not (logs / name).exists():
-        pytest.importorskip("rosbags")
         from test_bags import ros1_bag
 
         ros1_bag(logs)
     if format == "MP4" and not (logs / name).exists():
-        pytest.importorskip("av")
         write_video(logs / name, pictures(COUNT), codec="libx264", pixels="yuv420p", fps=50)
     copy = shutil.copytree if inner else shutil.copy
     log = Path(copy(logs / name, folder / name))

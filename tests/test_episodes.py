@@ -18,8 +18,8 @@ from message_files import write_table
 import cdmisfa as package
 from cdmisfa.core.arrays import GRAY, centred, mean_of
 from replay.corpus.episode_source import EpisodeSource
-from replay.logs.formats.lerobot import PAUSE
 from replay.open_sources import locations
+from replay.stored_source import PAUSE
 
 STEP_MS = 50
 SIZE = 16, 24
@@ -283,7 +283,6 @@ def test_apply_takes_each_log_of_a_corpus_as_an_episode(
 
 
 def test_episodes_of_a_dataset_are_its_own(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    pytest.importorskip("av")
     episodes = scenes(3, 30)
     each = zip((0, 1000, 2000), episodes, strict=True)
     times = [(START_MS + (at + i) * STEP_MS, x) for at, own in each for i, x in enumerate(own)]

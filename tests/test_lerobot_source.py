@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,10 +15,9 @@ from conftest import Cdmisfa
 from folders import external
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.logs.formats.lerobot import PAUSE
+from replay.corpus.index import read_index
 from replay.open_sources import open_recording
-
-pytest.importorskip("av")
+from replay.stored_source import PAUSE
 
 COUNT, FIRST = 60, 25
 KEY = "observation.images.cam"
@@ -67,6 +67,28 @@ def test_episodes_follow_one_another_after_a_pause(dataset: Path, kept: str) -> 
     ]
     np.testing.assert_array_equal(np.concatenate([b.frames for b in blocks]), expected)
     source.close()
+
+
+def test_no_frame_is_missing_between_episodes(cdmisfa: Cdmisfa, dataset: Path) -> None:
+    index = ["index", dataset, "--deep", "-o", dataset.parent / "all.parquet", "--json"]
+    assert cdmisfa(*index).code == 0
+    gaps = {row["topic"]: row["gaps"] for row in read_index(index[-2]).to_pylist()}
+    assert gaps[KEY] == 0
+    assert cdmisfa("verify", dataset, "--json").json["ok"]
+    video = next(dataset.rglob("*.mp4"))
+    with av.open(str(video)) as old, av.open(str(dataset.parent / "new.mp4"), "w") as new:
+        stream = new.add_stream_from_template(old.streams.video[0])
+        for i, packet in enumerate(p for p in old.demux(video=0) if p.dts is not None):
+            packet.stream = stream
+            if i != FIRST + 3:
+                new.mux(packet)
+    (dataset.parent / "new.mp4").replace(video)
+    assert cdmisfa(*index).code == 0
+    gaps = {row["topic"]: row["gaps"] for row in read_index(index[-2]).to_pylist()}
+    assert gaps[KEY] == 1
+    done = cdmisfa("verify", dataset, "--json")
+    assert done.code == 3
+    assert "has no frame at 0.56 s" in done.json["problems"][0]["what"]
 
 
 def test_numbers_come_back_as_they_were_exported(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -144,7 +144,6 @@ LOGS: dict[str, Callable[[Path], Path]] = {
 
 @pytest.mark.parametrize("kind", LOGS)
 def test_every_kind_of_message_gives_the_same_numbers(kind: str, tmp_path: Path) -> None:
-    pytest.importorskip("rosbags")
     path = LOGS[kind](tmp_path)
     source = external(path, ["/joint_states"], fields=["position[1:]", "position[0]"])
     with contextlib.closing(source):
@@ -176,7 +175,6 @@ def test_broken_messages_are_said_to_be(encoding: str) -> None:
     definition = descriptor_set(PoseInFrame.DESCRIPTOR)
     name = "foxglove.PoseInFrame"
     if encoding in ("cdr", "ros1"):
-        pytest.importorskip("rosbags")
         name, definition = "a_msgs/msg/A", b"float64[] a\nstring b\n"
     decode = message_decoder(MessageKind(name, encoding, definition, ""))
     assert decode is not None

@@ -76,7 +76,6 @@ def test_a_time_in_a_header_beyond_any_clock_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ros1", [True, False])
 def test_ros_says_it_in_the_header_that_a_message_begins_with(ros1: bool) -> None:
-    pytest.importorskip("rosbags")
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)

@@ -55,8 +55,6 @@ WAYS: dict[str, Callable[[Cdmisfa, Path], list[object]]] = {
 
 @pytest.mark.parametrize("way", WAYS)
 def test_what_is_learned_from_has_one_name(cdmisfa: Cdmisfa, tmp_path: Path, way: str) -> None:
-    if way in ("videos", "dataset"):
-        pytest.importorskip("av")
     done = cdmisfa("learn", *WAYS[way](cdmisfa, tmp_path), *QUICK, "-o", tmp_path / "run", "--json")
     assert done.code == 0, done.err
     assert done.json["undecided"] == list(NAMES)

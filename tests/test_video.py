@@ -15,8 +15,6 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.pixels import shrink
 from replay.logs.formats.video import VideoFile
 
-pytest.importorskip("av")
-
 SIZE = (HEIGHT, WIDTH)
 
 

@@ -9,8 +9,6 @@ import pytest
 from camera_files import pictures, write_video
 from conftest import Cdmisfa
 
-pytest.importorskip("av")
-
 FRAMES = 40
 FRAGMENTS = {"movflags": "frag_keyframe+empty_moov", "g": "5"}
 UNKNOWN = "it does not state its length, so a missing end cannot be detected"

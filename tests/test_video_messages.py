@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH
@@ -25,8 +26,6 @@ from recorder.images.options import InputOptions
 from recorder.images.videos import frame_gray
 from replay.logs.open_logs import open_stream
 from replay.logs.stream import LogStream
-
-av = pytest.importorskip("av")
 
 DECODERS = {"h265": "hevc", "av1": "libdav1d"}
 

@@ -7,7 +7,8 @@ to do. Only the command line turns an error into an exit code.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 Entry = TypeVar("Entry")
@@ -23,6 +24,10 @@ class UsageError(CdmisfaError):
     """Wrong option, configuration key or value, or a path that must not be used."""
 
     exit_code = 2
+
+
+class MissingPackageError(UsageError):
+    """Package that reads a log is not installed; the log may be whole."""
 
 
 class LogDamagedError(CdmisfaError):
@@ -43,6 +48,26 @@ class NotReproducedError(CdmisfaError):
     """Difference between a result and the result that it must equal."""
 
     exit_code = 4
+
+
+@contextmanager
+def needs(user: object, package: str, remedy: str = "") -> Iterator[None]:
+    """Turn a failed import into the error that `user`, such as a path, needs a package.
+
+    Args:
+        user: beginning of the error, as PATH: not read.
+        package: the package, or several.
+        remedy: what pip installs, if it has another name.
+
+    Raises:
+        MissingPackageError: the import failed.
+    """
+    try:
+        yield
+    except ImportError:
+        raise MissingPackageError(
+            f"{user}: needs the package {package} (pip install {remedy or package})"
+        ) from None
 
 
 def are_for(options: Sequence[str], purpose: str) -> str:

@@ -39,8 +39,8 @@ from recorder.log.files import (
     to_disk,
 )
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
-from replay.corpus.listing import INDEX
 from replay.export.applied import AppliedSink, written
+from replay.integrity.listing import INDEX
 
 # Folder of the state of the logs; programs that read data sets skip names with an underscore.
 STORE: Final = "_applied"

@@ -155,7 +155,7 @@ def open_source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     keys = config.get("input", {})
     chosen = {name: options[name] for name in INPUTS if name in options}
     if words != stated and not options.get("episodes"):
-        from replay.corpus.listing import may_be_corpus  # imports pyarrow, which is slow
+        from replay.integrity.listing import may_be_corpus  # imports pyarrow, which is slow
         from replay.open_sources import is_recording
 
         # The frames of a recording are made already, so that most input options do not apply.

@@ -286,7 +286,7 @@ def open_logs(
         UsageError: a path does not exist.
         LogDamagedError: a log is damaged.
     """
-    from replay.corpus.listing import may_be_corpus
+    from replay.integrity.listing import may_be_corpus
     from replay.open_sources import locations, open_log
     from replay.storage.paths import no_such
 

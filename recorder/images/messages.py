@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import CdmisfaError, one_line
+from cdmisfa.core.errors import CdmisfaError, needs, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.compressed import compressed_image, compressed_words
 from recorder.images.fields import (
@@ -350,10 +350,8 @@ def _ros(kind: MessageKind) -> MessageDecoder:
 
     @cache
     def deserializer() -> Any:
-        try:
+        with needs("not read", "rosbags"):
             from rosbags import typesys as ros
-        except ImportError:
-            raise CdmisfaError(f"{kind.schema} needs rosbags: pip install 'cdmisfa[ros]'") from None
         ros1 = kind.encoding == "ros1"
         text = kind.definition.decode("utf-8", "replace")
         if not text.strip():  # without a definition, use ROS's own

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import UsageError, needs
 from cdmisfa.core.untrusted import BUDGET
 from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
 
@@ -162,7 +162,7 @@ class VideoPackets:
         data, codec = self._packet_of(message)
         if not data:
             raise MalformedImage("its message is empty, without an image of its video")
-        av = pyav("a video in messages")
+        av = pyav("not read")
         name = _codec(codec)
         if name != self._codec:
             self._codec, self._context = name, av.CodecContext.create(name, "r")
@@ -199,15 +199,13 @@ def most_pixels(form: Any, codec: Any) -> int:
 
 
 def pyav(user: str) -> Any:
-    """Import PyAV, which `user` needs (the beginning of the error).
+    """Import PyAV, which is slow, for `user`, the beginning of the error.
 
     Raises:
-        UsageError: PyAV is not installed.
+        MissingPackageError: PyAV is not installed.
     """
-    try:
+    with needs(user, "av"):
         import av
-    except ImportError:
-        raise UsageError(f"{user} needs PyAV: pip install 'cdmisfa[video]'") from None
     av.logging.set_level(None)
     return av
 

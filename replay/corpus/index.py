@@ -20,7 +20,7 @@ from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import check_regular, parse_json
 from recorder.log.files import atomic_write, locked_folder, make_folder, refuse_unless
 from replay.corpus.index_rows import MARK, SCHEMA, VERSION, read_rows
-from replay.corpus.listing import INDEX, ListedLog, find_logs, may_be_corpus
+from replay.integrity.listing import INDEX, ListedLog, find_logs, may_be_corpus
 from replay.storage.location import is_url, location
 from replay.storage.paths import no_such
 
@@ -44,12 +44,14 @@ class Indexed:
 
     Attributes:
         index: the file.
-        logs: number of logs in it.
+        logs: number of logs in it; the files of a recording are one.
+        files: number of files, and of folders that are one log.
         streams: number of rows.
-        read: number of logs that were new or changed, and were read now.
-        kept: number of unchanged logs.
-        gone: paths of logs that no longer exist.
-        broken: number of logs with a problem.
+        read: number of files that were new or changed, and were read now.
+        kept: number of unchanged files.
+        gone: paths of files that no longer exist.
+        broken: number of files with a problem.
+        unread: number of files that were not read, as a package or a permission is missing.
         kinds: logs, files, streams, bytes and seconds of each kind of log; a recording is one log.
         problems: `path` and `problem` of the first `MOST_PROBLEMS` logs that have one.
         stopped: whether it was stopped before all logs were read.
@@ -57,11 +59,13 @@ class Indexed:
 
     index: Path
     logs: int = 0
+    files: int = 0
     streams: int = 0
     read: int = 0
     kept: int = 0
     gone: list[str] = field(default_factory=list)
     broken: int = 0
+    unread: int = 0
     kinds: list[dict[str, Any]] = field(default_factory=list)
     problems: list[dict[str, Any]] = field(default_factory=list)
     stopped: bool = False
@@ -110,10 +114,12 @@ def index_logs(
         LogWriteError: the index cannot be written.
     """
     index = _index_of(words, out)
+    logs = _logs_by_path(words, index)
+    if not logs and not index.exists():
+        raise UsageError(f"{' '.join(map(str, words))}: no log is in this folder or below it")
     make_folder(index.parent)
     with locked_folder(index.parent):
         indexed = Indexed(index)
-        logs = _logs_by_path(words, index.parent)
         table = SCHEMA.empty_table()
         if index.exists():
             table = read_index(index)
@@ -150,8 +156,10 @@ def _summarize(indexed: Indexed, table: pa.Table) -> None:
     """Count what an index has: its logs, those with a problem, and how much of each kind."""
     first = pc.equal(table["number"], 0)
     broken = table.filter(pc.and_(first, pc.is_valid(table["problem"])))
-    indexed.streams, indexed.logs = table.num_rows, len(pc.unique(table["path"]))
-    indexed.broken = len(broken)
+    indexed.streams, indexed.files = table.num_rows, len(pc.unique(table["path"]))
+    indexed.logs = len(pc.unique(table["log"]))
+    indexed.unread = broken["state"].to_pylist().count("not read")
+    indexed.broken = len(broken) - indexed.unread
     indexed.problems = broken.slice(0, MOST_PROBLEMS).select(["path", "problem"]).to_pylist()
     streams = pa.table(
         {
@@ -302,15 +310,17 @@ def _index_of(words: Sequence[str | Path], out: Path | None) -> Path:
     )
 
 
-def _logs_by_path(words: Sequence[str | Path], folder: Path) -> dict[str, ListedLog]:
-    """Return the logs by their paths, relative to the folder of the index."""
+def _logs_by_path(words: Sequence[str | Path], index: Path) -> dict[str, ListedLog]:
+    """Return the logs but the index by their paths, relative to the folder of the index."""
+    folder = index.parent
     below = os.path.join(folder, "")
     logs: dict[str, ListedLog] = {}
     for log in find_logs(words):
         path = log.file.removeprefix(below)
         if path == log.file and "://" not in path:
             path = os.path.relpath(path, folder)
-        logs[path] = log._replace(path=path)
+        if path != index.name:
+            logs[path] = log._replace(path=path)
     return logs
 
 
@@ -319,6 +329,8 @@ def _known_states(table: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
     known = table.filter(
         pc.and_(pc.not_equal(table["changed"], ""), pc.or_(table["deep"], not deep))
     )
+    # A log that was not read may be readable now, as when the missing package is installed.
+    known = known.filter(pc.not_equal(pc.fill_null(known["state"], ""), "not read"))
     columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))
     return {path: (size, changed) for path, size, changed in zip(*columns, strict=True)}
 

@@ -11,17 +11,18 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, MissingPackageError, UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import view_topic
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord
-from replay.corpus.listing import ListedLog, size_and_time
 from replay.integrity.info import describe_log, describe_reader
+from replay.integrity.listing import ListedLog, size_and_time
 from replay.integrity.report import failed
 from replay.logs.clock import missing
+from replay.logs.formats.lerobot import LAYOUT as DATASET
 from replay.logs.open_logs import identity_of, image_topics, is_external_format, open_stream
-from replay.logs.stream import ChannelInfo
+from replay.logs.stream import ChannelInfo, LogStream
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
@@ -169,14 +170,24 @@ def _decoded(place: Path, topic: str) -> dict[str, Any]:
     try:
         with open_stream(place, topic) as stream:
             shape = "x".join(map(str, stream.image(0).shape))
-            return {
-                "shape": shape,
-                "gaps": 0 if stream.times is None else int(missing(stream.times).sum()),
-            }
+            gaps = 0 if stream.times is None else int(missing(stream.times).sum())
+            if stream.program == DATASET:  # it pauses between episodes, where nothing is missing
+                gaps = sum(not _has(stream, row) for row in range(stream.count))
+            return {"shape": shape, "gaps": gaps}
+    except MissingPackageError:
+        raise
     except LogDamagedError as error:
         return {"problem": str(error).removeprefix(f"{place}: ")}
     except (MalformedRecord, UsageError):  # the topic has no image
         return {}
+
+
+def _has(stream: LogStream, row: int) -> bool:
+    try:
+        stream.fetch(row)
+    except MalformedRecord:
+        return False
+    return True
 
 
 def _hash_of(identity: Identity) -> str:

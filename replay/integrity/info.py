@@ -20,6 +20,7 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem, Segment
+from replay.integrity.listing import logs_at
 from replay.integrity.report import Crc, Kind, LogReport, SizeInfo, State, combined, failed
 from replay.integrity.run_facts import run_facts
 from replay.logs.formats.images import broken_images, image_files
@@ -27,7 +28,6 @@ from replay.logs.open_logs import channels_of, is_external_format, log_format
 from replay.logs.stream import ChannelInfo
 from replay.open_sources import locations
 from replay.runs.folders import RUN_METADATA
-from replay.storage.paths import log_files
 
 # Bytes of a log, decompressed or not, that `info` decodes; it reads the index of larger logs.
 CHECK_BYTES: Final = 1024 * 1024 * 1024
@@ -87,14 +87,14 @@ def report_all(
 
 def _describe_place(place: Path, alone: bool) -> Iterator[LogReport]:
     """Describe the logs in a place, the only one or not."""
-    logs = [place] if is_external_format(place) else log_files(place)
+    logs = logs_at(place)
     for log in logs:
         try:
-            yield describe_log(log)
+            yield describe_log(log.path_to_read())
         except CdmisfaError as error:
             if alone and len(logs) == 1:
                 raise
-            yield failed(log, error)
+            yield failed(log.file, error)
 
 
 def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:

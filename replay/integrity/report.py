@@ -147,9 +147,28 @@ class LogReport:
         ends = [c.end_ns for c in self.channels if c.end_ns is not None]
         return (min(starts), max(ends)) if starts and ends else None
 
+    def logs(self) -> list[LogReport]:
+        """Return a report for each log; the files of a recording in one folder are one."""
+        groups: dict[str, list[LogReport]] = {}
+        for file in self.files or (self,):
+            whole = str(Path(file.path).parent) if file.kind == "recording" else file.path
+            groups.setdefault(whole, []).append(file)
+        return [combined(path, files) for path, files in groups.items()]
+
+    @property
+    def seconds(self) -> float | None:
+        """Sum of the durations of the logs, in seconds; None if none is known."""
+        spans = [log.span for log in self.logs() if log.span is not None]
+        return sum(end - start for start, end in spans) / 1e9 if spans else None
+
     def as_json(self) -> dict[str, Any]:
-        """Return the report of `info` as JSON values."""
-        return {"schema": SCHEMA, **asdict(self)}
+        """Return the report of `info` as JSON values, with durations and rates."""
+        document = asdict(self)
+        for report, values in zip((self, *self.files), (document, *document["files"]), strict=True):
+            values["seconds"] = report.seconds
+            for channel, entry in zip(report.channels, values["channels"], strict=True):
+                entry["rate"] = channel.rate
+        return {"schema": SCHEMA, **document}
 
     def check_json(self) -> dict[str, Any]:
         """Return the report of `verify` as JSON values."""

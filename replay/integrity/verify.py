@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, MissingPackageError, UsageError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.core.untrusted import read_regular
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import Problem, Segment
 from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
+from replay.integrity.listing import logs_at
 from replay.integrity.report import LogReport, State, as_problem, combined, failed
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
@@ -38,7 +39,6 @@ from replay.runs.modules import load_modules
 from replay.runs.provenance import facts_sha256
 from replay.storage.arrays import MAX_BYTES
 from replay.storage.location import location
-from replay.storage.paths import log_files
 
 
 def check_logs(*words: str | Path) -> LogReport:
@@ -58,12 +58,20 @@ def check_log(path: str | Path) -> LogReport:
         CdmisfaError: a package that reads it is missing.
     """
     place = location(path)
-    if is_external_format(place):
-        return combined(str(place), [_check_external(place)])
     reports: list[LogReport] = []
     views: list[_ViewContent] = []
-    for file in log_files(place):
-        report, content = _check_file(file, beside=place.is_dir())
+    logs = logs_at(place)
+    for log in logs:
+        try:
+            file = log.path_to_read()
+            external, beside = is_external_format(file), file.parent == place
+            report, content = (
+                (_check_external(file), None) if external else _check_file(file, beside=beside)
+            )
+        except UsageError as error:
+            if len(logs) == 1:
+                raise
+            report, content = failed(log.file, error), None
         reports.append(report)
         if isinstance(content, _ViewContent):
             views.append(content)
@@ -86,7 +94,7 @@ def _check_file(path: Path, *, beside: bool) -> tuple[LogReport, _Content | None
         # The pass above failed at an image and not at a checksum: list all broken images.
         images = _check_topics(path, image_topics(path))
         notes = (*report.notes, *images.notes)
-        report = replace(report, problems=images.problems, notes=notes)
+        report = replace(report, problems=images.problems, notes=notes, state=images.state)
     return report, content
 
 
@@ -341,7 +349,9 @@ def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:
                 notes |= dict.fromkeys((*stream.remarks, *stream.warnings))
         except LogDamagedError as error:
             problems.append(as_problem(path, error))
-        except UsageError as error:  # it needs an option, or a package that is not installed
+        except MissingPackageError as error:
+            return failed(path, error)
+        except UsageError as error:  # it needs an option
             reason = str(error).removeprefix(f"{path}: ")
             notes[f"{path}: {topic} was not decoded: {reason}"] = None
     state: State = "damaged" if problems else "cut short" if missing else "whole"

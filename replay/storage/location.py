@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.errors import CdmisfaError, MissingPackageError, UsageError, needs, one_line
 
 SCHEMES: Final = ("s3", "http", "https")
 
@@ -66,14 +66,13 @@ def _copied(address: str) -> Path:
         raise UsageError(f"{scheme}:// is not supported: use {', '.join(SCHEMES)}, or a path")
     key = hashlib.sha256(address.encode()).hexdigest()[:16]
     parts = [part for part in place.split("/") if part not in ("", ".", "..")]
+    package = "s3fs" if scheme == "s3" else "aiohttp"  # fsspec's own, which it does not require
     target = _folder().joinpath(key, scheme, *parts)
     try:
-        _copy(scheme, address, target)
-    except ImportError as error:
-        raise UsageError(
-            f"{public_url}: reading URLs needs further packages ({one_line(error)}): "
-            "pip install 'cdmisfa[cloud]'"
-        ) from None
+        with needs(f"{public_url}: not read", package, "'cdmisfa[cloud]'"):
+            _copy(scheme, address, target)
+    except MissingPackageError:
+        raise
     except FileNotFoundError:
         raise CdmisfaError(f"{public_url}: no such file") from None
     except Exception as error:  # whatever fsspec's file systems raise

@@ -16,17 +16,16 @@ import click
 from cdmisfa.cli import options, printing
 from cdmisfa.core.errors import CdmisfaError
 
-REQUIRED = ("cdmisfa", "numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow")
+REQUIRED = ("cdmisfa", "numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow", "av",
+            "rosbags")  # fmt: skip
 
 # Optional dependencies by the name of the extra: modules, and features that need them.
 EXTRAS = {
-    "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
     "gym": (("gymnasium",), "gym: streams of simulated tasks; WatchEnv"),
     "rl": (("gymnasium", "stable_baselines3"), "examples/ppo.py"),
     "foxglove": (("websockets",), "foxglove:// streams of robots"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "paper": (("matplotlib",), "reproduce"),
-    "ros": (("rosbags",), "ROS bags: learn, convert"),
     "sklearn": (("sklearn",), "RecursiveSFA and IncSFA, estimators of scikit-learn"),
     "river": (("river",), "OnlineSFA, a transformer of river"),
     "dask": (("distributed",), "--scheduler of sweep, apply and reproduce"),

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from replay.corpus.index import Indexed
     from replay.integrity.report import LogReport, SizeInfo
     from replay.logs.source import LoggedSource
-    from replay.logs.stream import ChannelInfo
 
 # Largest number of streams of a run that `info` names, to keep them on one line.
 MOST_STREAMS = 8
@@ -64,24 +63,29 @@ def info_command(path: tuple[str, ...], as_json: bool) -> int:
 
 def _print_info(info: LogReport) -> None:
     """Print the description of a log, a recording, a run, or several of them."""
-    together = all(file.path.startswith(info.path) for file in info.files)
-    for part in [info] if together else info.files:
+    logs = info.logs()
+    for part in [info] if len(logs) == 1 else logs:
         words: list[str] = [part.state]
         if part.state != "not read":
             state = part.state.replace("unchecked", "contents not checked")
             crc = f"checksums {part.crc}".replace("checksums absent", "no checksums")
             words = [KIND_WORDS.get(part.kind, part.kind), state, crc]
             words += [] if part.seed is None else [f"seed {part.seed}"]
+        if len(logs) > 1 and part.seconds is not None:
+            words.append(f"{part.seconds:.3f} s")
         printing.line(f"{part.path}: {', '.join(words)}")
     for line in (*(f"{p.where}: {p.what}" for p in info.problems), *info.notes):
         printing.line(line)
     if info.run is not None:
         _print_run(info, info.run)
-    if info.span is not None:
+    if len(logs) > 1:
+        known = "" if info.seconds is None else f", {info.seconds:.3f} s in all"
+        printing.line(f"{counted(len(logs), 'log')}, {counted(info.messages, 'message')}{known}")
+    elif info.span is not None:
         printing.line(_length(info, *info.span))
     if info.size.file:
         printing.line(", ".join(_storage(info.size, info.library)))
-    _print_channels(info.channels)
+    _print_channels(logs)
 
 
 def _print_run(info: LogReport, run: Mapping[str, Any]) -> None:
@@ -131,19 +135,20 @@ def _storage(size: SizeInfo, library: str) -> Iterator[str]:
         yield f"written by {library}"
 
 
-def _print_channels(channels: Sequence[ChannelInfo]) -> None:
-    """Print a table of channels; times are seconds since the first message of all."""
-    first = min((c.start_ns for c in channels if c.start_ns is not None), default=0)
+def _print_channels(logs: Sequence[LogReport]) -> None:
+    """Print a table of channels; times are seconds since the first message of each log."""
+    channels = [channel for log in logs for channel in log.channels]
+    firsts = [log.span[0] if log.span else 0 for log in logs for _ in log.channels]
 
-    def since(ns: int | None) -> str:
+    def since(first: int, ns: int | None) -> str:
         return "-" if ns is None else f"{(ns - first) / 1e9:.3f}"
 
     columns: dict[str, list[object]] = {
         "topic": [c.topic for c in channels],
         "messages": [c.messages for c in channels],
         "Hz": ["-" if c.rate is None else f"{c.rate:.4g}" for c in channels],
-        "from, s": [since(c.start_ns) for c in channels],
-        "to, s": [since(c.end_ns) for c in channels],
+        "from, s": [since(t, c.start_ns) for t, c in zip(firsts, channels, strict=True)],
+        "to, s": [since(t, c.end_ns) for t, c in zip(firsts, channels, strict=True)],
         "encoding": [c.encoding for c in channels],
         "schema": [c.schema for c in channels],
         "file": [c.file for c in channels],
@@ -363,9 +368,10 @@ def _print_index(indexed: Indexed) -> None:
     from rich.filesize import decimal
 
     printing.line(
-        f"{counted(indexed.logs, 'log')}, {counted(indexed.streams, 'stream')}: "
+        f"{counted(indexed.logs, 'log')} in {counted(indexed.files, 'file')}, "
+        f"{counted(indexed.streams, 'stream')}: "
         f"{indexed.read} read, {indexed.kept} unchanged, {len(indexed.gone)} removed, "
-        f"{indexed.broken} with a problem"
+        f"{indexed.broken} with a problem, {indexed.unread} not read"
     )
     if indexed.kinds:
         head = "kind", "logs", "files", "streams", "length", "size"
@@ -374,6 +380,6 @@ def _print_index(indexed: Indexed) -> None:
         printing.table(head, [[*a, *b] for a, b in zip(cells, sizes, strict=True)])
     for row in indexed.problems:
         printing.line(f"{row['path']}: {row['problem']}")
-    if (more := indexed.broken - len(indexed.problems)) > 0:
+    if (more := indexed.broken + indexed.unread - len(indexed.problems)) > 0:
         printing.line(f"and {more} more logs with a problem")
     printing.line(f"index written to {indexed.index}")

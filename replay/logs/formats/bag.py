@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 
 from cdmisfa.core.arrays import IntArray
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.errors import LogDamagedError, needs
 from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import InputOptions
@@ -104,7 +104,7 @@ def streams(
     """Open the topics of a .bag, .db3 or rosbag2's folder.
 
     Raises:
-        CdmisfaError: the package rosbags is missing.
+        MissingPackageError: rosbags is not installed.
         UsageError: no such topic, or it has no images or fields as requested.
         LogDamagedError: rosbags cannot read it.
     """
@@ -133,7 +133,7 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
         whole: read every message in any case.
 
     Raises:
-        CdmisfaError: the package rosbags is missing.
+        MissingPackageError: rosbags is not installed.
         LogDamagedError: rosbags cannot read it.
     """
     with open_bag(path) as bag:
@@ -166,13 +166,9 @@ def _remark(path: Path) -> str:
 @contextlib.contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag; raises as `bag_channels` does."""
-    try:
+    with needs(f"{path}: not read", "rosbags"):
         from rosbags.rosbag1 import Reader as Rosbag1
         from rosbags.rosbag2 import Reader as Rosbag2
-    except ImportError:
-        raise CdmisfaError(
-            f"{path} is a ROS bag: reading it needs rosbags; pip install 'cdmisfa[ros]'"
-        ) from None
     ros1 = path.suffix == ".bag" and path.is_file()
     with _parts(path) as parts, ExitStack() as opened:
         with limited(path, "rosbags"):

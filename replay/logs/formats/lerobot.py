@@ -30,6 +30,9 @@ from replay.stored_source import PAUSE
 
 INFO: Final = "meta/info.json"
 
+# Name of the layout in errors.
+LAYOUT: Final = "LeRobot's layout"
+
 _IMAGES: Final = ("video", "image")
 
 # Features that number the frames.
@@ -49,7 +52,7 @@ class Dataset:
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self.path, self.info = path, _info(path)
         self.rows = _episodes(path, ["episode_index", "length", *columns])
-        with limited(path, "LeRobot's layout"):
+        with limited(path, LAYOUT):
             lengths = np.array([int(row["length"]) for row in self.rows], np.int64)
             self.starts = np.concatenate([[0], np.cumsum(lengths)])
             ticks = np.arange(self.starts[-1]) + np.repeat(np.arange(len(lengths)) * PAUSE, lengths)
@@ -101,7 +104,7 @@ def streams(
             decode=camera.decode,
             compressed=None if camera.video else bytes,
             memory_bytes=camera.memory_bytes,
-            program="LeRobot's layout",
+            program=LAYOUT,
             recipe=VIDEO_RECIPE if camera.video else RECIPE,
             warnings=camera.dataset.notes(topic),
         )
@@ -121,7 +124,7 @@ class _Camera:
         self.dataset = Dataset(path, [*keys, start])
         self._fps = float(self.dataset.info["fps"])
         scale = self._fps if self.video else 1
-        with explained(path, "LeRobot's layout"):
+        with explained(path, LAYOUT):
             rows = self.dataset.rows
             self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
             self._first = [round(float(row[start]) * scale) for row in rows]
@@ -145,10 +148,11 @@ class _Camera:
             self._file = file
         if not self.video:
             return self._compressed(place)
-        times = self._images.times
-        if place >= len(times) or abs(times[place] / NANOSECONDS * self._fps - place) >= 0.5:
+        times, half = self._images.times, NANOSECONDS / self._fps / 2
+        at = int(np.searchsorted(times, place * 2 * half - half))  # an earlier frame may be missing
+        if at >= len(times) or abs(times[at] / NANOSECONDS * self._fps - place) >= 0.5:
             raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
-        return place
+        return at
 
     def decode(self, stored: Any) -> ByteArray:
         """Decode what `fetch` returns."""
@@ -196,7 +200,7 @@ def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptio
     if not files:
         raise LogDamagedError(f"{path}: the tables of frames (data/*.parquet) are missing")
     numbers = np.concatenate([_columns(file, names) for file in files])
-    with limited(path, "LeRobot's layout", memory_bytes=numbers.nbytes):
+    with limited(path, LAYOUT, memory_bytes=numbers.nbytes):
         starts = dataset.starts
         firsts = np.array([int(row["dataset_from_index"]) for row in dataset.rows]) - starts[:-1]
         frames = numbers[np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))]
@@ -217,9 +221,10 @@ def is_dataset(path: Path) -> bool:
 def dataset_channels(path: Path) -> list[ExternalChannel]:
     """Return the features of a dataset, one value a frame."""
     info, channels = _info(path), []
+    last = max(int(info["total_frames"]) - 1, 0) * NANOSECONDS / float(info["fps"])
     for name, feature in info["features"].items():
         kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
-        channel = ChannelInfo(name, str(kind), shape, int(info["total_frames"]))
+        channel = ChannelInfo(name, str(kind), shape, int(info["total_frames"]), 0, round(last))
         channels.append(ExternalChannel(channel, images=kind in _IMAGES))
     return channels
 
@@ -250,7 +255,7 @@ def _columns(file: Path, names: Sequence[str]) -> FloatArray:
 
 
 def _info(path: Path) -> Any:
-    with explained(path / INFO, "LeRobot's layout"):
+    with explained(path / INFO, LAYOUT):
         info = read_json(path / INFO, "it does not describe a LeRobot dataset")
         version = str(info["codebase_version"])
         if not version.startswith("v3"):
@@ -279,5 +284,5 @@ def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
         with limited(file, "PyArrow"):
             table = pq.ParquetFile(file).read(columns=list(columns), use_threads=False)
             rows += table.to_pylist()
-    with explained(path, "LeRobot's layout"):
+    with explained(path, LAYOUT):
         return sorted(rows, key=lambda row: int(row["episode_index"]))

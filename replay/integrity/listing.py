@@ -7,13 +7,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.mcap.store import PARTIAL
 from replay.logs.formats.images import ENDINGS as IMAGE_ENDINGS
 from replay.logs.open_logs import ENDINGS, log_format
 from replay.open_sources import locations
 from replay.runs.folders import RUN_FILE
 from replay.storage.location import is_url
+from replay.storage.paths import no_such
 
 # Name of the index file in the folder that it indexes.
 INDEX: Final = "corpus.parquet"
@@ -39,6 +40,12 @@ class ListedLog(NamedTuple):
     problem: str = ""
     path: str = ""
 
+    def path_to_read(self) -> Path:
+        """Return its path; raise a UsageError if the listing found that it cannot be opened."""
+        if self.problem:
+            raise UsageError(f"{self.file}: {self.problem}")
+        return Path(self.file)
+
 
 def find_logs(words: Sequence[str | Path]) -> Iterator[ListedLog]:
     """Yield the logs that words name, and all logs below folders; each folder is listed once.
@@ -56,6 +63,20 @@ def find_logs(words: Sequence[str | Path]) -> Iterator[ListedLog]:
                 yield from _below(str(place), listed)
             else:
                 yield _log_file(str(place))
+
+
+def logs_at(place: Path) -> list[ListedLog]:
+    """Return the logs in a folder and below it, as `index` lists them; of a file, itself.
+
+    Raises:
+        UsageError: no such file or folder, or it has no log.
+    """
+    if not place.exists():
+        raise no_such(place)
+    logs = list(find_logs([place])) if place.is_dir() else [ListedLog(str(place))]
+    if not logs:
+        raise UsageError(f"{place}: no log is in this folder or below it")
+    return logs
 
 
 def may_be_corpus(words: Sequence[str | Path]) -> bool:
