@@ -65,6 +65,16 @@ def test_more_parts_than_files_may_be_open_are_read(parts: Path) -> None:
     limited("-c", script, str(parts))
 
 
+def test_a_view_on_a_full_disk_ends_with_one_line(tmp_path: Path, oscillatory_run: Path) -> None:
+    view = tmp_path / "a.rrd"
+    small = functools.partial(resource.setrlimit, resource.RLIMIT_FSIZE, (40_000, 40_000))
+    words = ("-m", "cdmisfa", "view", str(oscillatory_run), "--save", str(view))
+    done = python(*words, preexec_fn=small)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"cdmisfa: {view} cannot be written: ")
+    assert (done.stderr.count("\n"), list(tmp_path.iterdir())) == (1, [])
+
+
 @pytest.fixture
 def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file that is opened for each read, as those are that do not stay open."""

@@ -329,3 +329,5 @@ class LogReader(LogStructure):
             self._searched = True
             for segment in self.segments:
                 self.table(segment)
+            if self._limit is None and self.data_crc is not None:
+                self._define_behind_data()

@@ -7,6 +7,7 @@ summary with them.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from bisect import bisect_left
 from collections.abc import Iterator
@@ -206,6 +207,20 @@ class LogStructure:
         # The CRC of a cut chunk is that of its complete records.
         if self.torn is not None and (self.skip_damaged or not self.torn.crc):
             self.segments.append(self.torn)
+
+    def _define_behind_data(self) -> None:
+        """Take further schemas and channels from a summary that the footer does not name."""
+        at, defined = self._at, self.definitions
+        known = {Opcode.SCHEMA: {*defined.schemas}, Opcode.CHANNEL: {*defined.channels}}
+        with contextlib.suppress(MalformedRecord, struct.error):
+            while True:
+                opcode, length = RECORD_HEADER.unpack(self.file.peek(at, RECORD_HEADER.size))
+                if opcode not in known:
+                    return
+                record = self._definition(at + RECORD_HEADER.size, length)
+                if int.from_bytes(record[:2], "little") not in known[Opcode(opcode)]:
+                    defined.add(opcode, record, f"byte {at}")
+                at += RECORD_HEADER.size + length
 
     # The outer records
 

@@ -141,7 +141,8 @@ def recording_to(
             yield recording
             recording.flush(timeout_sec=FLUSH_SECONDS)
         except RuntimeError as error:
-            raise CdmisfaError(f"{out} cannot be written: {error}") from error
+            what = f"{out} cannot be written: {error}; check the free space there"
+            raise CdmisfaError(what) from error
         finally:
             recording.disconnect()
 
