@@ -152,6 +152,19 @@ def test_a_recovered_file_is_whole_and_has_all_messages_outside_the_damage(
             assert cdmisfa("learn", out, "--max-iterations", 5).code == 0
 
 
+def test_a_view_without_a_readable_chunk_is_damage(
+    cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_recording: Path
+) -> None:
+    folder = shutil.copytree(oscillatory_recording, tmp_path / "rec")
+    file = folder / "x1.mcap"
+    with LogReader(file) as reader:
+        places = [8 * (chunk.data_offset + chunk.stored // 2) for chunk in reader.segments]
+    file.write_bytes(flipped(file.read_bytes(), *places))
+    for log in (folder, file):
+        done = cdmisfa("verify", log)
+        assert (done.code, done.out.count("its CRC does not match") > 30) == (3, True)
+
+
 def test_a_log_that_ends_before_its_first_message_gives_no_file(
     cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_recording: Path
 ) -> None:

@@ -305,7 +305,7 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
         return
     try:
         source = LoggedSource(recorded.streams(views, skip_damaged=True))
-    except LogDamagedError as error:
+    except CdmisfaError as error:
         yield replace(as_problem(views[0].path, error), where=folder)
         return
     ends = {name: ranges[-1][1] for name, ranges in source.coverage().items() if not source.gaps}
