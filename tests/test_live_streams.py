@@ -237,6 +237,12 @@ def test_images_and_numbers_of_a_running_robot_are_recorded_and_learned_from(
     assert run["source"]["fields"] == ["k"]
     with open_recording(tmp_path / "k" / "rec") as source:
         assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
+    words = [f"{robot.address}/words", f"{robot.address}/cam/left", "--size", "32x24"]
+    run = learned_twice(cdmisfa, tmp_path / "both", *words)
+    assert "words: 1 number" in run["said"]
+    assert run["source"]["size"] == [[1], [24, 32]]
+    run = learned_twice(cdmisfa, tmp_path / "part", TEST, words[0], "--field", "k")
+    assert run["source"]["size"][1] == [1]
     with pytest.raises(UsageError, match="there is no z: it has k"):
         open_live([f"{robot.address}/words"], InputOptions(fields=("z",)))
 

@@ -78,16 +78,6 @@ def test_a_module_has_no_output_on_streams_of_another_kind(run: Any) -> None:
         np.testing.assert_array_equal(own, later & (streams == module.stream_index))
 
 
-def test_frames_of_a_run_are_returned_by_stream(run: Any) -> None:
-    attended = int((run.signals["stream"] == 1).sum())
-    assert run.frames(stream="joints").shape == (40 * attended, 3)
-    t = np.flatnonzero(np.repeat(run.signals["stream"], 40) == 1)
-    np.testing.assert_array_equal(run.frames(stream="joints"), joints()[t])
-    assert run.frames(stream="camera").shape[1:] == (12, 16)
-    with pytest.raises(ValueError, match="name a stream: one of camera, joints"):
-        run.frames()
-
-
 def test_runs_are_checked_resumed_viewed_and_reported(
     cdmisfa: Cdmisfa, run: Any, tmp_path: Path
 ) -> None:
@@ -101,6 +91,8 @@ def test_runs_are_checked_resumed_viewed_and_reported(
     page = (run.report(tmp_path / "page.html")).read_text()
     assert "camera" in page
     assert "joints" in page
+    with pytest.raises(ValueError, match="frames of several shapes"):
+        run.frames()
     run.view(tmp_path / "run.rrd")
     assert (tmp_path / "run.rrd").stat().st_size > 100_000
 

@@ -141,16 +141,17 @@ def option(spec: str, help: str = "", *, name: str | None = None, **about: Any) 
 INPUTS: dict[str, Decorator] = {
     "topics": option(
         "--topic TOPIC",
-        "Read this topic of a log, or all that match a pattern such as '/cam*'; each becomes a "
-        "stream. Repeatable. [default: the only one with images]",
+        "Read this topic of a log, or all with images that match a pattern such as '/cam*'; each "
+        "becomes a stream, without images one of numbers. Repeatable. [default: the only one with "
+        "images]",
         name="topics",
         multiple=True,
     ),
     "fields": option(
         "--field FIELD",
         "Read these numbers: a field of the messages, such as pose.position.x or ranges[0:100], or "
-        "a column of a table. Repeatable; several form one vector. [default: images, or all "
-        "columns of a table]",
+        "a column of a table. Repeatable; several form one vector. [default: images; all numbers "
+        "of a table, or of a --topic without images]",
         name="fields",
         multiple=True,
     ),

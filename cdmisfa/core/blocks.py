@@ -80,6 +80,8 @@ class SourceSpec:
         """Return the spec of streams with frames of some kinds; `about` is `truth` to `length`."""
         if len(set(kinds)) == 1:
             return cls(tuple(streams), *kinds[0], *about)
+        if len({shape for shape, dtype in kinds if len(shape) == 2}) > 1:
+            raise UsageError("the images of the streams differ in size: give all one size")
         return replace(cls(tuple(streams), (), "mixed", *about), kinds=tuple(kinds))
 
     def __post_init__(self) -> None:

@@ -171,6 +171,8 @@ def configure_for(
         raise UsageError(f"{are_for(misplaced, 'live scenes')}, and this source is not one")
     if inputs is not None and inputs.fields and spec.images:
         raise UsageError(f"{', '.join(spec.streams)} has no numbers: leave out --field")
+    if inputs is not None and inputs.range and any(len(shape) > 1 for shape, _ in spec.kinds):
+        raise UsageError("input.range is for images or for numbers, not for both: leave it out")
     scene = str(described.get("scene", ""))
     kind = scene if scene in SCENES else str(settings.section("scene")[0].get("kind"))
     if kind not in SCENES:

@@ -19,7 +19,7 @@ from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.resume import Recomputation
 from cdmisfa.public.recording import Recording, as_words, view
 from replay.runs.columns import whole_signals
-from replay.runs.log import EVENT_TOPIC, FRAME_TOPICS, Event, RunHeader, read_batches, read_columns
+from replay.runs.log import EVENT_TOPIC, WATCHED_TOPIC, Event, RunHeader, read_batches, read_columns
 from replay.runs.run import read_outline
 
 # Signals that are one number in each iteration.
@@ -130,46 +130,31 @@ class Run(Described, replay.runs.run.StoredRun):
         batches = read_batches(self.log, self.header, topics=(EVENT_TOPIC,))
         return tuple(event for batch in batches for event in batch.events)
 
-    def frames(
-        self, start: int = 0, stop: int | None = None, stream: str | None = None
-    ) -> NDArray[Any]:
+    def frames(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return the frames of the attended streams in the iterations [start, stop).
 
         The log has every frame of vectors, and every tenth image; `Recording.frames` has all.
-
-        Args:
-            start: first iteration.
-            stop: iteration after the last; None: all.
-            stream: name of the stream whose frames are returned; None: all, if they have one shape.
 
         Returns:
             (n, *frame_shape).
 
         Raises:
-            ValueError: the iterations or the stream do not exist, or the streams' shapes differ.
+            ValueError: the iterations do not exist, or the streams' frames differ in shape.
         """
-        spec = self.header.spec
-        if stream not in (None, *spec.streams) or (stream is None and spec.kinds):
-            raise ValueError(f"name a stream: one of {', '.join(spec.streams)}")
-        wanted = None if stream is None else spec.streams.index(stream)
+        if self.header.spec.kinds:
+            raise ValueError("the streams have frames of several shapes: use Recording.frames")
         count = len(self.signals["iteration"])
         stop = count if stop is None else stop
         if not 0 <= start < stop <= count:
             raise ValueError(f"no iterations [{start}, {stop}): {self.path} has [0, {count})")
         starts, tau = self.signals["t"], self.signals["y"].shape[1]
         first, last = int(starts[start]), int(starts[stop - 1]) + tau
-        shape, dtype = spec.kind(wanted or 0)
-        parts = [np.empty((0, *shape), dtype)]
-        attended = self.signals["stream"]
-        for batch in read_batches(self.log, self.header, topics=FRAME_TOPICS, start=first):
+        parts = [np.empty((0, *self.header.spec.frame_shape), self.header.spec.dtype)]
+        for batch in read_batches(self.log, self.header, topics=(WATCHED_TOPIC,), start=first):
             for t, frames in batch.watched:
-                chosen = (t >= first) & (t < last)
-                if wanted is not None:
-                    chosen &= attended[np.searchsorted(starts, t, side="right") - 1] == wanted
-                if chosen.any():
-                    parts.append(frames[chosen])
-            if batch.watched and all(t[-1] >= last for t, _ in batch.watched):
-                break
+                parts.append(frames[(t >= first) & (t < last)])
+                if t[-1] >= last:
+                    return np.concatenate(parts)
         return np.concatenate(parts)
 
     def at(self, iterations: int, source: Any = ()) -> Learner:

@@ -13,13 +13,14 @@ import logging
 import struct
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.live import Steady
-from recorder.images.messages import Decoder, MessageKind, decoder_of
+from recorder.images.messages import Decoder, MessageKind, decoder_of, options_for
 from recorder.images.options import IMAGES, RECIPE, InputOptions
 from recorder.images.pixels import Content
 from recorder.images.videos import VideoPackets
@@ -69,8 +70,9 @@ class FoxgloveCamera:
     recipe = RECIPE
 
     def __init__(self, host: str, topic: str, name: str, options: InputOptions = IMAGES) -> None:
-        self.name, self._options = name, options
         self._server, self._topic = f"ws://{host}", topic.rstrip("/")
+        topics = (self._topic,) if self._topic else ()
+        self.name, self._options = name, replace(options, topics=topics)
         self._public_address = f"foxglove://{host.rpartition('@')[2]}"
         try:
             import websockets.sync.client as client
@@ -140,14 +142,15 @@ class FoxgloveCamera:
             for channel in event["channels"] if event.get("op") == "advertise" else ():
                 topic = str(channel["topic"])
                 channels[topic] = channel
-                if decoder := decoder_of(_kind(channel), self._options):
+                messages = _kind(channel)
+                if decoder := decoder_of(messages, options_for(topic, messages, self._options)):
                     decoders[topic] = decoder
             topic = self._topic or (next(iter(decoders)) if len(decoders) == 1 else "")
             if topic in decoders:
                 return int(channels[topic]["id"]), decoders[topic]
             if topic in channels:
                 kind = channels[topic].get("schemaName")
-                lacks = "no fields" if self._options.fields else "no images: use --field"
+                lacks = "neither images nor known fields"
                 raise CdmisfaError(f"{self._public_address}{topic} is {kind}, with {lacks}")
         content = "messages with fields" if self._options.fields else "images"
         problem = f"has no topic {self._topic}" if self._topic else "does not have one such topic"

@@ -67,8 +67,8 @@ class Camera(Protocol):
 class CameraFrames:
     """Converter of the images of several cameras to frames of one size.
 
-    The default size is the `default_size` for the first image of the first camera; earlier images
-    of other cameras are skipped.
+    The default size is the `default_size` for the first image of the first camera with images;
+    images of other cameras before all earlier streams began are skipped.
 
     Args:
         names: names of the cameras.
@@ -89,7 +89,6 @@ class CameraFrames:
     ) -> None:
         self._names, self._say = names, say
         self._size, self._fit, self._color = size, fit, color
-        self._first: Content | None = None
         self._framings: dict[int, Framing] = {}
         self._changed: set[int] = set()
 
@@ -101,11 +100,17 @@ class CameraFrames:
         """
         name = self._names[camera]
         if camera not in self._framings:
-            if image.ndim > 1 and self._size is None and camera:
+            earlier = [self._framings.get(number) for number in range(camera)]
+            if image.ndim > 1 and self._size is None and None in earlier:
                 return None
-            self._first = image if self._first is None else self._first
-            both = [self._first, image]
-            framing = framings(both, self._size, self._fit, color=self._color)[1]
+            known = list(self._framings.values())
+            if image.ndim < 2 and (
+                len(known) + 1 < len(self._names) or any(f.first for f in known)
+            ):
+                framing = Framing((), image.shape)  # as another stream may have images
+                self._say(f"{name}: {framing}")
+            else:
+                framing = framings([image], self._size, self._fit, color=self._color)[0]
             self._framings[camera] = framing
             if framing.first:
                 self._size = framing.shape[0], framing.size[1]

@@ -12,14 +12,12 @@ from itertools import chain, count, islice
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray, FloatArray, as_array, without_table
 from cdmisfa.core.blocks import (
     Block,
     ForwardSource,
-    FrameKind,
     SourceSpec,
     check_request,
     freeze,
@@ -28,7 +26,7 @@ from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.gaps import stretches
 from cdmisfa.core.names import ACTION, BEGINS
-from recorder.images.framing import Recipe, default_size, framings, make_frame, size_of
+from recorder.images.framing import Recipe, framings, make_frame
 from recorder.images.options import COLOR_RECIPE, RECIPE, Fit, Size
 
 # Largest seed that Gymnasium's spaces accept on every system.
@@ -106,18 +104,17 @@ class ArraySource(SteppedSource):
             given = (dict(zip(streams, row, strict=True)) for row in rows)
         steps = (step if isinstance(step, Mapping) else {"stream": step} for step in given)
         first = next(steps, {})
-        frames = [None if f is None else np.atleast_1d(as_array(f, n)) for n, f in first.items()]
-        kinds = [_kind(frame, size) for frame in frames if frame is not None]
-        if not kinds:
+        present = next((frame for frame in first.values() if frame is not None), None)
+        if present is None:
             raise UsageError(
                 'the first step has no frame: yield an array or {"left": array, ...} for each time '
                 "step"
             )
-        frame_size = next((shape for shape, dtype in kinds if dtype == "uint8"), None)
-        kinds = [kinds[0] if frame is None else _kind(frame, frame_size) for frame in frames]
+        given_frames = [(n, present if f is None else f) for n, f in first.items()]
+        frames = [np.atleast_1d(as_array(frame, str(name))) for name, frame in given_frames]
+        kinds = [framing.kind for framing in framings(frames, size, "crop")]
         rate = getattr(streams, "fps", 50.0) if fps is None else fps
-        names = [*map(str, first)]
-        spec = SourceSpec.of_kinds(names, kinds, (), rate, start_ns, length)
+        spec = SourceSpec.of_kinds([*map(str, first)], kinds, (), rate, start_ns, length)
         self.gaps = length is None
         framed = _framed(spec, tuple(first), chain([first], steps))
         super().__init__(spec, chain([next(framed)], framed))  # checks the first frames at once
@@ -125,13 +122,6 @@ class ArraySource(SteppedSource):
     def describe(self) -> Mapping[str, Any]:
         """Return the kind of the source, and the names of its streams."""
         return {"kind": "arrays", "streams": list(self._spec.streams)}
-
-
-def _kind(frame: NDArray[Any], size: Any) -> FrameKind:
-    """Return shape and type of the frames of a stream with this first image or numbers."""
-    if frame.ndim < 2:
-        return frame.shape, "float64"
-    return size or default_size(size_of(frame)), "uint8"
 
 
 def _framed(

@@ -81,7 +81,8 @@ def open_live(
         "fit": options.fit,
     }
     if options.fields:
-        about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
+        recipes = NUMBERS_RECIPE if len(words) == 1 else f"{about['recipe']}; {NUMBERS_RECIPE}"
+        about |= {"recipe": recipes, "fields": list(options.fields)}
     if color:
         about["recipe"] = COLOR_RECIPE
     if options.range is not None:

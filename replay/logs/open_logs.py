@@ -141,7 +141,9 @@ class OpenLogs:
                         files[0], alone, opened, skip_damaged=skip_damaged
                     )
             self.streams.sort(
-                key=lambda s: next(i for i, t in enumerate(topics) if fits_topic(s.topic, [t]))
+                key=lambda s: next(
+                    (i for i, t in enumerate(topics) if fits_topic(s.topic, [t])), len(topics)
+                )
             )
 
 

@@ -31,7 +31,6 @@ SIGNALS_TOPIC = "/signals"
 WATCHED_TOPIC = "/watched"
 # Numbers of the attended stream, if the source has images too.
 VALUES_TOPIC = "/values"
-FRAME_TOPICS = (WATCHED_TOPIC, VALUES_TOPIC)
 PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
@@ -234,8 +233,9 @@ class BatchReader:
     ) -> None:
         self._log, self._spec, self._every = log, header.spec, every
         kinds = self._spec.every_kind
-        self._images = {shape for shape, dtype in kinds if len(shape) == 2 and dtype == "uint8"}
-        self._numbers = {shape for shape, _ in kinds} - self._images
+        images = [(shape, dtype) for shape, dtype in kinds if len(shape) == 2 and dtype == "uint8"]
+        self._images = images[0][0] if images else ()
+        self._numbers = [shape for shape, dtype in kinds if (shape, dtype) not in images]
         self._wanted = {n: c.topic for n, c in channels.items() if c.topic in topics}
         self._begin(Blocks.concatenated(()))
 
@@ -311,30 +311,25 @@ class BatchReader:
                 raise LogDamagedError(f"{where}: a record has other streams than the run")
         return records
 
-    def _watched_images(self) -> Iterator[Frames]:
-        """Yield the decoded images of the batch, one array for each shape."""
-        if not self._images:
-            return
-        where, frames = f"{self._log} {WATCHED_TOPIC}", self._frames[WATCHED_TOPIC]
-        by_shape: dict[tuple[int, int], list[tuple[int, bytes]]] = {}
-        for t, message in zip(frames, self._data[WATCHED_TOPIC], strict=True):
-            image = parsed(RawImage_pb2.RawImage, message, where)
-            shape, pixels = (image.height, image.width), image.data
-            if shape not in self._images or len(pixels) != math.prod(shape):
+    def _watched_images(self) -> tuple[Frames, ...]:
+        """Return the decoded images of the batch as one array, or none."""
+        where, shape = f"{self._log} {WATCHED_TOPIC}", self._images
+        data = self._data[WATCHED_TOPIC] if shape else ()
+        images = [parsed(RawImage_pb2.RawImage, message, where).data for message in data]
+        if not images:
+            return ()
+        for pixels in images:
+            if len(pixels) != math.prod(shape):
                 raise LogDamagedError(f"{self._log}: {len(pixels)} values do not fill {shape}")
-            by_shape.setdefault(shape, []).append((t, pixels))
-        for shape, images in by_shape.items():
-            numbers, parts = zip(*images, strict=True)
-            whole = np.frombuffer(b"".join(parts), np.uint8).reshape(len(parts), *shape)
-            yield np.array(numbers, dtype=np.int64), whole
+        whole = np.frombuffer(b"".join(images), np.uint8).reshape(len(images), *shape)
+        return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), whole),)
 
     def _rows(self, topic: str, *shapes: tuple[int, ...]) -> tuple[Frames, ...]:
         """Return the rows of matrix messages, one per frame, of one of some shapes."""
         by_size = {math.prod(shape): shape for shape in shapes}
-        if not shapes:
-            return ()
         pieces = []
-        for t, values in decode_matrices(self._data[topic], f"{self._log} {topic}"):
+        data = self._data[topic] if shapes else ()
+        for t, values in decode_matrices(data, f"{self._log} {topic}"):
             frames = (t[:, None] + np.arange(values.shape[1])).reshape(-1)
             shape = by_size.get(values.shape[2])
             if shape is None:

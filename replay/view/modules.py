@@ -24,7 +24,7 @@ from replay.runs.run import Outline
 from replay.truth_fits import truth_fits
 from replay.view.image_grid import BETWEEN, grid_positions, place_image, sheet_size
 from replay.view.layouts import Panel
-from replay.view.writer import Writer, drawable, for_stream
+from replay.view.writer import Writer, drawable
 
 PHI = "abstraction/phi"
 
@@ -93,7 +93,8 @@ class Weights:
 
     In a run of the progress learner each stream has a candidate, and the log has the weights of
     the candidate whose stream is next. They are shown once that stream is attended; until then
-    its previous weights are shown, or none (white).
+    its previous weights are shown, or none (white). None are if streams have frames of several
+    kinds.
 
     Args:
         writer: writer of the Rerun recording.
@@ -107,26 +108,23 @@ class Weights:
     def take(self, batch: Batch) -> None:
         """Write the weights of some iterations."""
         logged = dict(batch.phi)
-        for columns in batch.signals:
+        for columns in () if self._writer.spec.kinds else batch.signals:
             watched = columns["stream"]
             owners = np.where(columns["saved"], watched, columns["next_stream"])
             owners = owners if self._by_progress else watched
             signals = (columns.frames, columns.iterations, watched, owners)
             for t, iteration, s, owner in zip(*(v.tolist() for v in signals), strict=True):
-                phi, visible, spec = logged.get(t), None, self._writer.spec
-                if self._by_progress and s != self._stream and self._phi and not spec.kinds:
+                phi, visible = logged.get(t), None
+                if self._by_progress and s != self._stream and self._phi:
                     visible = self._phi.get(s, 0 * next(iter(self._phi.values())))
                 self._stream = s
                 if phi is not None:
-                    if not self._phi or (spec.kinds and owner not in self._phi):
-                        place = for_stream(PHI, spec, owner)
-                        hang_weights(self._writer, place, owner, _numbers(phi))
+                    if not self._phi:
+                        hang_weights(self._writer, PHI, 0, _numbers(phi))
                     self._phi[owner] = phi
-                    visible = phi if owner == s or spec.kinds else visible
+                    visible = phi if owner == s else visible
                 if visible is not None:
-                    stream = owner if spec.kinds else s
-                    place = for_stream(PHI, spec, stream)
-                    write_weights(self._writer, place, stream, t, iteration, visible)
+                    write_weights(self._writer, PHI, 0, t, iteration, visible)
 
 
 class ModulesView:

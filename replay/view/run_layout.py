@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 
 import rerun.blueprint as rrb
 
@@ -63,6 +63,10 @@ def run_layout(
     return layouts.blueprint(*tabs, layout.modules(sheets), name="Run", length=outline.end, tab=tab)
 
 
+# Colors of weights of images.
+COLOURS = " (blue < 0, orange > 0)"
+
+
 class RunLayout:
     """The tabs of a run; they adapt to its streams and modules, and to the signals it has.
 
@@ -77,7 +81,7 @@ class RunLayout:
         self._writer, self._spec, self._has_scene = writer, outline.header.spec, has_scene
         keys = ("roc_error", "delta", "novel_share", "min_variance")
         self._facts = {key: f"{self._header.number(key) or 0.0:g}" for key in keys}
-        self._facts["colours"] = " (blue < 0, orange > 0)" if self._spec.images else ""
+        self._facts["colours"] = COLOURS if self._spec.images else ""
         self._facts["interval"] = f", every {PHI_EVERY} blocks" if outline.iterations else ""
 
     def tab(self, tab: Tab) -> rrb.Container:
@@ -128,7 +132,8 @@ class RunLayout:
         if panel.kind == "input":
             return [self._input(title)]
         if panel.kind == "weights":
-            return [self._weights(panel.entities[0], title)]
+            paths = () if self._spec.kinds else panel.entities[:1]
+            return [self._weights(path, title, self._spec) for path in paths]
         count = min(self._outline.modules, MOST_MODULES) if panel.each_module else 1
         views: Views = []
         for i in range(1, count + 1):
@@ -192,9 +197,9 @@ class RunLayout:
         """Return a module's page: weights, frames, and its output, also around its save."""
         left, output = ([view] for view in self._module_views(i))
         name = f"Module {i}"
-        if has_sheet and (spec := self._spec_of(i)) is not None:
+        if has_sheet:
             title = "Frames with the least, middle and greatest output 1"
-            width, height = sheet_size(*spec.frame_shape)
+            width, height = sheet_size(*self._spec_of(i).frame_shape)
             bounds = grid_bounds(3, height, width, columns=1)
             left.append(images(f"/modules/{i}/sheet", title, bounds))
         for save in (save for save in self._outline.saved if save.module == i):
@@ -215,12 +220,11 @@ class RunLayout:
 
     def _module_views(self, i: int) -> Views:
         """Return a module's weights, and its output while its stream was attended."""
-        colours = self._facts["colours"]
+        spec = self._spec_of(i)
+        colours = COLOURS if spec.images else ""
         output = f"Output of module {i} [SD] while its stream was attended"
         return [
-            self._weights_of(
-                f"/modules/{i}/weights", f"Weights of module {i}{colours}", self._spec_of(i)
-            ),
+            self._weights(f"/modules/{i}/weights", f"Weights of module {i}{colours}", spec),
             curve_view(output, [f"/modules/{i}/output", f"/modules/{i}/saved"], self._end),
         ]
 
@@ -238,48 +242,24 @@ class RunLayout:
             height, width = self._spec.frame_shape
             # A fifth of it below for the name.
             return images("/world/watched", name, ((0, width), (0, height + 0.2 * height)))
-        values: Views = [
-            images(path, title)
-            if self._spec.of(s).images
-            else curve_view(title, [path], recent=RECENT)
-            for s, path, title in self._places("/world/watched", "Input values")
-        ]
-        whose = layouts.state_rows("Attended stream", ["/attended/each_block"], recent=RECENT)
-        return rrb.Vertical(*values, whose, row_shares=[*(3 for _ in values), 2])
-
-    def _places(self, path: str, title: str) -> Iterator[tuple[int, str, str]]:
-        """Yield stream, entity and title of each kind of frames: one if all have one kind."""
-        if not self._spec.kinds:
-            yield 0, path, title
-            return
-        for s in range(min(len(self._spec.streams), MOST_STREAMS)):
-            title_of = f"{drawable(self._spec.streams[s])}: {title}"
-            yield s, for_stream(path, self._spec, s), title_of
-
-    def _spec_of(self, module: int) -> SourceSpec | None:
-        """Return the spec of a module's stream; None if frames differ and it is unknown."""
-        if not self._spec.kinds:
-            return self._spec
-        streams = (save.stream for save in self._outline.saved if save.module == module)
-        stream = next(streams, None)
-        return None if stream is None else self._spec.of(stream)
-
-    def _weights(self, path: str, name: str) -> rrb.View | rrb.Container:
-        """Return the weights of the candidate of the attended stream, of each kind of frames."""
-        places = self._places(path, name)
-        return beside([self._weights_of(p, title, self._spec.of(s)) for s, p, title in places])
-
-    def _weights_of(
-        self, path: str, name: str, spec: SourceSpec | None
-    ) -> rrb.View | rrb.Container:
-        """Return weights for frames of a spec: as images, or bars; both if it is unknown."""
         views: Views = []
+        for s, stream in enumerate(self._spec.streams[:MOST_STREAMS] if self._spec.kinds else [""]):
+            path = f"/{for_stream('world/watched', self._spec, s)}"
+            title = drawable(stream) or "Input values"
+            shows = self._spec.of(s).images
+            views.append(images(path, title) if shows else curve_view(title, [path], recent=RECENT))
+        whose = layouts.state_rows("Attended stream", ["/attended/each_block"], recent=RECENT)
+        return rrb.Vertical(*views, whose, row_shares=[*(3 for _ in views), 2])
+
+    def _spec_of(self, module: int) -> SourceSpec:
+        """Return the spec of a module's stream."""
+        streams = {save.module: save.stream for save in self._outline.saved}
+        return self._spec.of(streams.get(module, 0))
+
+    def _weights(self, path: str, name: str, spec: SourceSpec) -> rrb.View:
         outputs = self._outline.outputs
-        if spec is None or spec.images:
-            several = spec is not None and outputs > 1
-            bounds = grid_bounds(outputs, *spec.frame_shape) if spec and several else None
-            views.append(images(path, name, bounds))
-        if spec is None or not spec.images:
+        if not spec.images:
             hidden = rrb.PlotLegend(visible=False)
-            views.append(rrb.BarChartView(origin=path, name=name, plot_legend=hidden))
-        return beside(views)
+            return rrb.BarChartView(origin=path, name=name, plot_legend=hidden)
+        bounds = grid_bounds(outputs, *spec.frame_shape) if outputs > 1 else None
+        return images(path, name, bounds)
