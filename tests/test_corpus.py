@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from camera_files import pictures, write_images, write_pictures
+from camera_files import pictures, write_images, write_pictures, write_video
 from conftest import Cdmisfa
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -187,6 +187,33 @@ class TestBadInput:
 
 
 class TestSummary:
+    def test_info_and_verify_show_every_log_that_it_lists(
+        self, cdmisfa: Cdmisfa, corpus: Path
+    ) -> None:
+        for name in ("torn.mcap", "text.mcap", "empty.mcap"):
+            (corpus / name).unlink()
+        shutil.copytree(corpus / "night" / "one", corpus / "night" / "two")
+        late = ((4_000_000 + 50 * i, image) for i, image in enumerate(pictures(20, 9)))
+        write_images(corpus / "late.mcap", {"/camera": late})
+        write_video(corpus / "film.mkv", pictures(26))
+        (corpus / "t.csv").write_text("a,b\n1,2\n3,4\n")
+        assert cdmisfa("index", corpus).code == 0
+        listed = {str(corpus / row["path"]) for row in rows_of(corpus)}
+        document = cdmisfa("info", corpus, "--json").json
+        assert {file["path"] for file in document["files"]} == listed
+        checked = cdmisfa("verify", corpus, "--json").json
+        assert (checked["ok"], {file["file"] for file in checked["files"]}) == (True, listed)
+        out = cdmisfa("info", corpus).out
+        seconds = dict.fromkeys(("robot.mcap", "late.mcap"), 0.95) | {"film.mkv": 1.0}
+        for name, each in seconds.items():
+            assert re.search(rf"{name}: external log, .*, {each:.3f} s$", out, re.MULTILINE)
+        parts = ("night/one", "runs")
+        one, run = (cdmisfa("info", corpus / p, "--json").json["seconds"] for p in parts)
+        total = 2.9 + 2 * one + run
+        assert document["seconds"] == pytest.approx(total)
+        assert re.search(rf"^9 logs, \d+ messages, {total:.3f} s in all$", out, re.MULTILINE)
+        assert f"{corpus / 't.csv'}, {corpus / 'seen'}: no times: learn and convert need" in out
+
     def test_it_says_how_much_there_is_and_what_is_broken(
         self, cdmisfa: Cdmisfa, corpus: Path
     ) -> None:

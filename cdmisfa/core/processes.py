@@ -20,7 +20,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.errors import CdmisfaError, needs, one_line
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -67,7 +67,7 @@ def run_all(
         Index and result of a task, as soon as it is finished.
 
     Raises:
-        UsageError: dask is not installed.
+        MissingPackageError: dask is not installed.
         WorkersError: a worker died, or the scheduler does not answer.
     """
     jobs = min(jobs, len(tasks))
@@ -197,10 +197,8 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
 
     joblib's own backend for dask (1.6) waits forever for a task that has killed every worker.
     """
-    try:
+    with needs("--scheduler", "distributed", "'cdmisfa[dask]'"):
         distributed: Any = importlib.import_module("distributed")
-    except ImportError as error:
-        raise UsageError("--scheduler needs dask: pip install 'cdmisfa[dask]'") from error
     # Otherwise it logs a traceback for every lost connection; errors that matter are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.errors import CdmisfaError, needs, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.live import Steady
 from recorder.images.messages import Decoder, MessageKind, decoder_of, options_for
@@ -62,7 +62,7 @@ class FoxgloveCamera:
         options: the fields to read, the range of distances, and whether to decode colors.
 
     Raises:
-        UsageError: websockets is missing.
+        MissingPackageError: websockets is not installed.
     """
 
     finite = False
@@ -74,13 +74,8 @@ class FoxgloveCamera:
         topics = (self._topic,) if self._topic else ()
         self.name, self._options = name, replace(options, topics=topics)
         self._public_address = f"foxglove://{host.rpartition('@')[2]}"
-        try:
+        with needs(self._public_address, "websockets", "'cdmisfa[foxglove]'"):
             import websockets.sync.client as client
-        except ImportError:
-            raise UsageError(
-                f"{self._public_address} needs a package that is missing: "
-                "pip install 'cdmisfa[foxglove]'"
-            ) from None
         self._client = client
 
     def images(self) -> Iterator[tuple[int, Content]]:

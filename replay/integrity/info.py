@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TypeVar
@@ -20,7 +20,7 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem, Segment
-from replay.integrity.listing import logs_at
+from replay.integrity.listing import each_report
 from replay.integrity.report import Crc, Kind, LogReport, SizeInfo, State, combined, failed
 from replay.integrity.run_facts import run_facts
 from replay.logs.formats.images import broken_images, image_files
@@ -46,7 +46,7 @@ def describe(*words: str | Path) -> LogReport:
         UsageError: no such log.
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
-    report = report_all(words, _describe_place)
+    report = report_all(words, lambda place, alone: each_report(place, describe_log, alone))
     facts = {} if len(words) > 1 else run_facts(Path(report.path), report.channels)
     return replace(report, **facts)
 
@@ -83,18 +83,6 @@ def report_all(
             reports.append(failed(place, error))
     path = " ".join([*map(str, places), *(report.path for report in failures)])
     return combined(path, reports + failures)
-
-
-def _describe_place(place: Path, alone: bool) -> Iterator[LogReport]:
-    """Describe the logs in a place, the only one or not."""
-    logs = logs_at(place)
-    for log in logs:
-        try:
-            yield describe_log(log.path_to_read())
-        except CdmisfaError as error:
-            if alone and len(logs) == 1:
-                raise
-            yield failed(log.file, error)
 
 
 def describe_log(log: Path, *, decode: bool | None = None) -> LogReport:

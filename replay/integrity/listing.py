@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.mcap.store import PARTIAL
+from replay.integrity.report import LogReport, failed
 from replay.logs.formats.images import ENDINGS as IMAGE_ENDINGS
 from replay.logs.open_logs import ENDINGS, log_format
 from replay.open_sources import locations
@@ -40,12 +41,6 @@ class ListedLog(NamedTuple):
     problem: str = ""
     path: str = ""
 
-    def path_to_read(self) -> Path:
-        """Return its path; raise a UsageError if the listing found that it cannot be opened."""
-        if self.problem:
-            raise UsageError(f"{self.file}: {self.problem}")
-        return Path(self.file)
-
 
 def find_logs(words: Sequence[str | Path]) -> Iterator[ListedLog]:
     """Yield the logs that words name, and all logs below folders; each folder is listed once.
@@ -65,8 +60,15 @@ def find_logs(words: Sequence[str | Path]) -> Iterator[ListedLog]:
                 yield _log_file(str(place))
 
 
-def logs_at(place: Path) -> list[ListedLog]:
-    """Return the logs in a folder and below it, as `index` lists them; of a file, itself.
+def each_report(
+    place: Path, read: Callable[[Path], LogReport], alone: bool = True
+) -> Iterator[LogReport]:
+    """Yield the report of each log in a folder and below it, as `index` lists them; of a file, its.
+
+    Args:
+        place: the folder or file.
+        read: returns the report of a log.
+        alone: raise the error of the only log instead of reporting it.
 
     Raises:
         UsageError: no such file or folder, or it has no log.
@@ -76,7 +78,15 @@ def logs_at(place: Path) -> list[ListedLog]:
     logs = list(find_logs([place])) if place.is_dir() else [ListedLog(str(place))]
     if not logs:
         raise UsageError(f"{place}: no log is in this folder or below it")
-    return logs
+    for log in logs:
+        try:
+            if log.problem:
+                raise UsageError(f"{log.file}: {log.problem}")
+            yield read(Path(log.file))
+        except CdmisfaError as error:
+            if alone and len(logs) == 1:
+                raise
+            yield failed(log.file, error)
 
 
 def may_be_corpus(words: Sequence[str | Path]) -> bool:

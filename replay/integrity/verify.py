@@ -19,7 +19,7 @@ from cdmisfa.core.untrusted import read_regular
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import Problem, Segment
 from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
-from replay.integrity.listing import logs_at
+from replay.integrity.listing import each_report
 from replay.integrity.report import LogReport, State, as_problem, combined, failed
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
@@ -58,25 +58,19 @@ def check_log(path: str | Path) -> LogReport:
         CdmisfaError: a package that reads it is missing.
     """
     place = location(path)
-    reports: list[LogReport] = []
-    views: list[_ViewContent] = []
-    logs = logs_at(place)
-    for log in logs:
-        try:
-            file = log.path_to_read()
-            external, beside = is_external_format(file), file.parent == place
-            report, content = (
-                (_check_external(file), None) if external else _check_file(file, beside=beside)
-            )
-        except UsageError as error:
-            if len(logs) == 1:
-                raise
-            report, content = failed(log.file, error), None
-        reports.append(report)
+    views: dict[Path, list[_ViewContent]] = {}
+
+    def check(file: Path) -> LogReport:
+        if is_external_format(file):
+            return _check_external(file)
+        report, content = _check_file(file, beside=place.is_dir())
         if isinstance(content, _ViewContent):
-            views.append(content)
-    problems = _check_views(views, alone=place.is_file()) if views else ()
-    return combined(str(place), reports, problems)
+            views.setdefault(file.parent, []).append(content)
+        return report
+
+    reports = list(each_report(place, check))
+    checks = [_check_views(contents, alone=place.is_file()) for contents in views.values()]
+    return combined(str(place), reports, itertools.chain(*checks))
 
 
 def _check_file(path: Path, *, beside: bool) -> tuple[LogReport, _Content | None]:

@@ -35,8 +35,9 @@ def info_command(path: tuple[str, ...], as_json: bool) -> int:
     """Show what a log, recording or run contains.
 
     The command prints topics, times and sizes, and for a run its modules and the result of each
-    stream. The exit code is 2 if a path is no log, and 3 if a log is damaged or cut short (3
-    wins). Contents that only cdmisfa verify reads are reported as not
+    stream. For a folder it shows every log in it and below it, the duration of each and the sum.
+    The exit code is 2 if a path is no log or a package that reads it is missing, and 3 if a log is
+    damaged or cut short (3 wins). Contents that only cdmisfa verify reads are reported as not
     checked.
 
     PATH is one of:
@@ -83,6 +84,12 @@ def _print_info(info: LogReport) -> None:
         printing.line(f"{counted(len(logs), 'log')}, {counted(info.messages, 'message')}{known}")
     elif info.span is not None:
         printing.line(_length(info, *info.span))
+    even = [log.path for log in logs if log.kind == "foreign" and log.channels and not log.span]
+    if even:
+        printing.line(
+            f"{', '.join(even)}: no times: learn and convert need --rate, or for a table "
+            "--set input.time=COLUMN"
+        )
     if info.size.file:
         printing.line(", ".join(_storage(info.size, info.library)))
     _print_channels(logs)
@@ -166,7 +173,8 @@ def verify_command(path: tuple[str, ...], as_json: bool) -> int:
     """Verify that logs are complete and undamaged.
 
     The command reads every byte, compares checksums, and decodes every image of a log that has no
-    checksums. The exit code is 2 if a path is no log, and 3 if a log is damaged (3 wins).
+    checksums. The exit code is 2 if a path is no log or a package that reads it is missing, and 3
+    if a log is damaged (3 wins).
 
     PATH is one of:
         {run}
