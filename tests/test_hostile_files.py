@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import shutil
 import socket
 import zipfile
 from collections.abc import Callable
@@ -22,10 +25,11 @@ from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS, read_trial_rows
 from cdmisfa.modules import Module
 from recorder.log.logfile import LogFile
+from recorder.mcap.reader import LogReader
 from replay.integrity.info import describe
 from replay.logs.formats.images import MAX_IMAGE, image_files
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json
-from replay.runs.log import read_header
+from replay.runs.log import header_in, read_header
 from replay.runs.modules import load_modules, save_modules
 from replay.storage.arrays import stored_arrays
 
@@ -54,6 +58,22 @@ def test_no_device_and_no_huge_file_is_read_of_a_run(
     assert read_run_json(tmp_path) == {}
     with pytest.raises(UsageError, match=why):
         load_modules(tmp_path)
+
+
+def test_facts_of_a_run_that_make_no_sense_are_left_out_or_damage(
+    cdmisfa: Cdmisfa, tmp_path: Path, oscillatory_run: Path
+) -> None:
+    run = shutil.copytree(oscillatory_run, tmp_path / "run")
+    facts = read_run_json(run)
+    result = {**facts["result"], "held_out": {"frames": [math.inf, 9], "modules": []}}
+    text = json.dumps({**facts, "result": result}).replace("Infinity", "1e999")
+    (run / "run.json").write_text(text)
+    assert cdmisfa("info", run, "--json").json["held_out"] is None
+    with LogReader(run / "run.mcap") as reader:
+        record = next(r for r in reader.metadata if r.name == RUN_METADATA)
+        record.metadata["manifest"] = "7"
+        with pytest.raises(LogDamagedError, match="is broken"):
+            header_in(reader)
 
 
 def test_compressed_modules_are_refused(tmp_path: Path) -> None:

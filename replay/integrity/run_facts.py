@@ -20,7 +20,7 @@ from replay.runs.log import SIGNALS_TOPIC, read_header
 from replay.runs.modules import load_modules
 
 # Errors of reading fields of a document whose structure is unknown.
-_NO_SENSE: Final = (LookupError, TypeError, ValueError, AttributeError)
+_NO_SENSE: Final = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def run_facts(place: Path, channels: Sequence[ChannelInfo]) -> dict[str, Any]:

@@ -129,7 +129,7 @@ def header_in(reader: LogReader) -> RunHeader:
         spec["kinds"] = tuple((tuple(shape), str(kind)) for shape, kind in spec.get("kinds", ()))
         if len(spec["kinds"]) not in (0, len(spec["streams"])):
             raise ValueError("it has other kinds than streams")
-        return RunHeader(SourceSpec(**spec), parse_json(metadata["manifest"], MAX_LIST))
+        return RunHeader(SourceSpec(**spec), {**parse_json(metadata["manifest"], MAX_LIST)})
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
