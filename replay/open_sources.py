@@ -195,7 +195,7 @@ def _with_color(
     with opened(replace(inputs, color=True)) as colored:
         color = shows_hue(colored)
     source = opened(replace(inputs, color=color))
-    source.notes = (CHOSEN[color],)
+    source.notes = (CHOSEN[color], *source.notes)
     return source
 
 

@@ -162,7 +162,7 @@ class TestRuns:
         result = json.loads((run / "run.json").read_text())["result"]
         again = cdmisfa(*words, "--json").json | {"run": str(run)}
         resumed = cdmisfa("learn", "--resume", "-o", run, "--no-rerun", "--json").json
-        assert again == resumed == result | {"warnings": []}
+        assert again == resumed == result | {"warnings": [], "notes": []}
         assert (result["ended"], result["iterations"]) == ("log_exhausted", blocks)
         assert result["undecided"] == ["x1", "x2", "x3"]
         assert (

@@ -103,13 +103,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 def source(frames: FrameSource) -> None:
     """Print warnings about a source, how its images become frames, and how its streams align."""
+    from cdmisfa.experiments.documents import notes_of
+
     for text in getattr(frames, "warnings", ()):
         warning(text)
-    for note in getattr(frames, "notes", ()):
+    for note in notes_of(frames):
         status(note)
-    for name, framing in zip(frames.spec.streams, getattr(frames, "framings", ()), strict=False):
-        if "," in str(framing):  # else the frame is the image itself
-            status(f"{name}: {framing}")
     unit = "images" if frames.spec.images else "messages"
     for name, counts in getattr(frames, "alignment", {}).items():
         status(
@@ -138,14 +137,14 @@ def source_changes(frames: FrameSource) -> None:
 # Results of runs
 
 
-def result(run: RunResult, warnings: Sequence[str] | None) -> None:
-    """Print the result of a run that has ended: as JSON with the source's warnings, if given."""
+def result(run: RunResult, about: Mapping[str, Any] | None) -> None:
+    """Print the result of a run that has ended: as JSON with keys about its source, if given."""
     from cdmisfa.core.names import counted
     from cdmisfa.core.outcomes import END_REASONS
     from replay.integrity.report import ModuleInfo
 
-    if warnings is not None:
-        json_document({**run.as_json(), "warnings": warnings})
+    if about is not None:
+        json_document({**run.as_json(), **about})
         return
     streams = run.summary.get("streams")
     modules([ModuleInfo.of(m) for m in run.modules], policies=streams is None)

@@ -43,6 +43,18 @@ def warnings_of(source: object) -> list[str]:
     return [*getattr(source, "warnings", ()), *changes, *damage]
 
 
+def notes_of(source: Any) -> list[str]:
+    """Return how the images of a source become frames, and what it usually leaves out."""
+    framings = zip(source.spec.streams, getattr(source, "framings", ()), strict=False)
+    changed = [f"{name}: {framing}" for name, framing in framings if "," in str(framing)]
+    return [*getattr(source, "notes", ()), *changed]
+
+
+def about_source(source: object) -> dict[str, list[str]]:
+    """Return the warnings and notes about a source, as keys of a JSON document."""
+    return {"warnings": warnings_of(source), "notes": notes_of(source)}
+
+
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a Markdown table, without a line end after the last line."""
     lines = (head, ["---"] * len(head), *rows)

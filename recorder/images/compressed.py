@@ -22,7 +22,15 @@ from PIL.PngImagePlugin import PngImageFile
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.untrusted import BUDGET, budget
-from recorder.images.pixels import MAX_PIXELS, MalformedImage, by_bands
+from recorder.images.pixels import (
+    ALPHA,
+    GRAY,
+    HIGH_BYTE,
+    MAX_PIXELS,
+    MalformedImage,
+    by_bands,
+    lost,
+)
 
 # Largest number of pixels of an image that is decoded in a thread, where no memory limit works.
 MAX_THREAD_PIXELS: Final = 4_000_000
@@ -66,7 +74,10 @@ def compressed_image(data: bytes, *, color: bool = False, limit: int = MAX_PIXEL
     with _decoded(data, limit) as image:
         if image.mode in _WORDS:
             words = np.asarray(image)
+            lost(HIGH_BYTE)
             return by_bands(words, lambda part: (part.astype(np.int64) >> 8).clip(0, 255))
+        lost(ALPHA, image.has_transparency_data)
+        lost(GRAY, not color and image.mode not in ("1", "L", "LA"))
         rgb = image if image.mode in ("L", "RGB") else image.convert("RGB")
         return np.array(rgb if color else rgb.convert("L"), np.uint8)
 
@@ -112,6 +123,7 @@ def _decoded(data: bytes, limit: int = MAX_PIXELS) -> Iterator[ImageFile]:
 
 def _turn_upright(image: ImageFile) -> None:
     try:
+        lost("images are turned upright as their EXIF states", image.getexif().get(0x0112, 1) != 1)
         ImageOps.exif_transpose(image, in_place=True)
     except MemoryError:
         raise

@@ -11,13 +11,16 @@ import numpy as np
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.options import Depth
-from recorder.images.pixels import MalformedImage
+from recorder.images.pixels import MalformedImage, lost
 
 # Largest number of values from a message, more than any laser scan has.
 MAX_NUMBERS: Final = 100_000
 
 # Largest value up to which float64 represents every whole number.
 EXACT: Final = 2.0**53
+
+# Warning about larger numbers.
+ROUNDED: Final = "numbers above 2^53 may be rounded to float64"
 
 _STEP: Final = re.compile(r"\.?([^.\[\]]+)|\[(\d{1,9})\]|\[(\d{0,9}):(\d{0,9})\]")
 _PATH: Final = re.compile(rf"[^.\[\]]+(?:\.[^.\[\]]+|{_STEP.pattern.partition('|')[2]})*")
@@ -167,6 +170,7 @@ def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
     """Limit numbers to bounds; values that are not finite become the lower bound."""
     if bounds is None:
         return numbers
+    lost(f"numbers that are not finite become {bounds[0]:g}", not np.isfinite(numbers).all())
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
 
 

@@ -19,7 +19,7 @@ from cdmisfa.core.config import Section, key
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.names import counted
 from recorder.images.compressed import compressed_image
-from recorder.images.fields import EXACT, bounded
+from recorder.images.fields import EXACT, ROUNDED, bounded
 from recorder.images.options import Centre, Depth, Fit, Size
 from recorder.images.pixels import Content, MalformedImage, raw_image, shrink
 
@@ -69,8 +69,7 @@ class Framing:
     def change(self, image: Content) -> str:
         """Return a warning about an image of another size, or about rounded numbers, or ""."""
         if not self.first:
-            rounded = bool(len(image)) and np.abs(image).max() > EXACT
-            return "numbers beyond 2^53 are rounded to float64" if rounded else ""
+            return ROUNDED if len(image) and np.abs(image).max() >= EXACT else ""
         size = size_of(image)
         if size == self.first:
             return ""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Final
 
 import numpy as np
@@ -44,6 +46,31 @@ DISTANCES: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32
 
 # Pixels that are converted at a time, because intermediate arrays take several bytes for each.
 _BAND: Final = 1 << 20
+
+
+# Losses that several decoders have.
+GRAY: Final = "colors become gray: keep them with --color on"
+HIGH_BYTE: Final = "16-bit pixels are reduced to their high byte"
+ALPHA: Final = "transparency is ignored"
+
+_losses: ContextVar[list[str] | None] = ContextVar("_losses", default=None)
+
+
+@contextmanager
+def losses() -> Iterator[list[str]]:
+    """Collect what decoders drop, reduce or turn in this thread, as `lost` states it."""
+    lines: list[str] = []
+    token = _losses.set(lines)
+    try:
+        yield lines
+    finally:
+        _losses.reset(token)
+
+
+def lost(line: str, when: object = True) -> None:
+    """State a loss of the image that is decoded, on a condition, to `losses`."""
+    if when and (lines := _losses.get()) is not None:
+        lines.append(line)
 
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - its text lacks the place
@@ -113,7 +140,12 @@ def raw_image(
         distances = np.ndarray((height, width), kind, raw, 0, (step, size))
         return by_bands(distances, lambda part: _depth_gray(part, metres, depth))
     rows = np.ndarray((height, width, size), np.uint8, raw, 0, (step, size, 1))
+    lost(GRAY, not color and (size > 2 or encoding in _BAYER))
+    lost(ALPHA, "X" in ENCODINGS.get(encoding, ""))
+    lost(f"distances ({encoding}) are read as gray: set --set input.range=NEAR,FAR", number)
     if size < 3:
+        lost(HIGH_BYTE, size == 2)
+        lost("two by two pixels of a Bayer pattern become one", encoding in _BAYER)
         high = rows[:, :, 0 if big_endian else size - 1]
         order = _BAYER.get(encoding)
         return np.ascontiguousarray(high) if order is None else _bayer(high, order, color=color)
@@ -160,7 +192,9 @@ def _depth_gray(values: NDArray[Any], metres: float, depth: Depth) -> FloatArray
     """Map distances to gray; 0, infinity and NaN mean no measurement and become black."""
     near, far = depth
     distances = values.astype(np.float64) * metres
-    distances[~np.isfinite(distances) | (distances <= 0)] = near
+    absent = ~np.isfinite(distances) | (distances <= 0)
+    lost("pixels without a distance become black", absent.any())
+    distances[absent] = near
     return np.floor((np.clip(distances, near, far) - near) * (255 / (far - near)) + 0.5)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError, needs
 from cdmisfa.core.untrusted import BUDGET
-from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
+from recorder.images.pixels import GRAY, MAX_PIXELS, MalformedImage, lost, raw_image
 
 # Images that a decoder can hold if they depend on one another: 16 and the present one (H.264).
 _MAX_HELD: Final = 17
@@ -40,6 +40,7 @@ _UNIT: Final = re.compile(b"\0\0\1(.)", re.DOTALL)
 
 def frame_gray(frame: Any) -> ByteArray:
     """Return the luma of a PyAV frame, or the gray of its colors, upright, (height, width)."""
+    lost(GRAY, not frame.format.name.startswith("gray"))
     return _upright(_luma(frame), frame)
 
 
@@ -53,10 +54,13 @@ def _upright(pixels: ByteArray, frame: Any) -> ByteArray:
 
     Source: FFmpeg's libavutil/display.h. A point (x, y) is displayed at (a x + c y, b x + d y).
     """
+    bits = max(component.bits for component in frame.format.components)
+    lost(f"{bits}-bit pixels are reduced to 8 bits", bits > 8)
     stated = frame.side_data.get("DISPLAYMATRIX")
     if stated is None:
         return pixels
     a, b, _, c, d = np.frombuffer(stated, np.int32)[:5].tolist()
+    lost("images are turned upright as their display matrix states", b or a < 0 or d < 0)
     if abs(b) > abs(a):
         pixels = pixels.swapaxes(0, 1)
         right, down = c, b

@@ -18,7 +18,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.framing import Framing, framings
 from recorder.images.options import COLOR_RECIPE, InputOptions
-from recorder.images.pixels import Content
+from recorder.images.pixels import GRAY, Content, losses
 from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
@@ -89,6 +89,7 @@ class LoggedSource(StoredSource):
         self._last_frames: dict[int, tuple[int, Content]] = {}
         self._together = False
         self._images: Images | None = None
+        self._losses: list[tuple[LogStream, str]] = []
         try:
             self._open()
         except BaseException:
@@ -96,6 +97,8 @@ class LoggedSource(StoredSource):
             raise
         self.left_out = tuple(left_out)
         self.warnings = (*left_out, *dict.fromkeys(self._warnings()))
+        usual = [f"{log.path}: {line}" for log, line in self._losses if line == GRAY]
+        self.notes = tuple(dict.fromkeys([*usual, *(n for log in self.streams for n in log.notes)]))
 
     def _open(self) -> None:
         """Put the streams on one clock, and find out how an image becomes a frame."""
@@ -120,7 +123,11 @@ class LoggedSource(StoredSource):
             self._images = images = Images(
                 self.streams, color=self.color, skip_damaged=self._skip_damaged
             )
-            firsts = [images.image(i, int(rows[0])) for i, rows in enumerate(clock.rows)]
+            firsts = []
+            for i, rows in enumerate(clock.rows):
+                with losses() as lines:
+                    firsts.append(images.image(i, int(rows[0])))
+                self._losses += [(self.streams[i], line) for line in lines]
             how = self._options
             self.framings = made = framings(firsts, how.size, how.fit, color=self.color)
             kinds = [framing.kind for framing in made]
@@ -241,6 +248,7 @@ class LoggedSource(StoredSource):
     def _warnings(self) -> Iterator[str]:
         for stream in self.streams:
             yield from stream.warnings
+        yield from (f"{log.path}: {line}" for log, line in self._losses if line != GRAY)
         clock = self._clock
         handling = "no block spans a gap" if self.gaps else "the last image is repeated"
         for stream, gaps in zip(self.streams, clock.gaps, strict=True):

@@ -68,6 +68,7 @@ class LogStream:
         fields: fields that are read instead of images, in order.
         columns: returns the name of each number of a row.
         warnings: lines to print for the user.
+        notes: lines on what is usually left out.
         remarks: a line for each property that the format cannot guarantee, as without checksums.
         missing: the missing part of a truncated file, or "".
         reader: the MCAP file, if all rows are in one.
@@ -94,6 +95,7 @@ class LogStream:
     fields: Sequence[str] = ()
     columns: Callable[[], Sequence[str]] = tuple
     warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()
     remarks: Sequence[str] = ()
     missing: str = ""
     reader: LogReader | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,7 +99,7 @@ def learn_command(
         cdmisfa learn camera:/dev/video0 --record recordings/desk -o runs/desk
         cdmisfa learn recordings/kitchen --loop --max-modules 2 -o runs/kitchen
     """
-    from cdmisfa.experiments.documents import warnings_of
+    from cdmisfa.experiments.documents import about_source
     from cdmisfa.experiments.run_folder import command_of
     from cdmisfa.experiments.session import Session
     from recorder.cameras.words import is_live
@@ -132,8 +132,8 @@ def learn_command(
             hashing=progress.hashing,
         )
         result = _run_learner(session, stop, progress, rerun=not no_rerun, live_view=live_view)
-    warnings = warnings_of(frames) if as_json else None
-    code = _print_run(result, stop, can_resume=not live, warnings=warnings)
+    about = about_source(frames) if as_json else None
+    code = _print_run(result, stop, can_resume=not live, about=about)
     return code or (LogDamagedError.exit_code if getattr(frames, "left_out", ()) else 0)
 
 
@@ -213,7 +213,7 @@ def _run_learner(
 
 
 def _print_run(
-    result: RunResult, stop: Stop, *, can_resume: bool, warnings: Sequence[str] | None
+    result: RunResult, stop: Stop, *, can_resume: bool, about: Mapping[str, Any] | None
 ) -> int:
     """Print the result of a run, write its report unless interrupted; return the exit code.
 
@@ -221,12 +221,12 @@ def _print_run(
         result: the result.
         stop: the signals so far.
         can_resume: whether an interrupted run can be continued.
-        warnings: warnings about the source, for a JSON document; None for text.
+        about: keys about the source, for a JSON document; None for text.
     """
     from cdmisfa.core.outcomes import INTERRUPTED
     from cdmisfa.experiments.reports import write_report
 
-    printing.result(result, warnings)
+    printing.result(result, about)
     folder = printing.quoted(result.run or "")
     if result.ended == INTERRUPTED:
         if folder and can_resume:
@@ -240,7 +240,7 @@ def _print_run(
                 f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
             )
         else:
-            if warnings is None:
+            if about is None:
                 printing.line(f"report written to {page}")
     if more := result.more_passes:
         again = f"continue with cdmisfa learn --resume --passes {more} -o {folder}"
@@ -293,6 +293,7 @@ def fork_command(
         cdmisfa fork runs/kitchen --iteration 100 --seed 7 -o runs/seed7
         cdmisfa fork runs/kitchen --iteration 0 --max-modules 2 -o runs/two
     """
+    from cdmisfa.experiments.documents import about_source
     from cdmisfa.experiments.session import Session
 
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
@@ -304,4 +305,5 @@ def fork_command(
         result = _run_learner(session, stop, progress, rerun=not no_rerun)
     both = f"{printing.quoted(run)} {printing.quoted(output)}"
     printing.status(f"compare both with cdmisfa compare {both} --save both.rrd")
-    return _print_run(result, stop, can_resume=True, warnings=[] if as_json else None)
+    about = about_source(session.source) if as_json else None
+    return _print_run(result, stop, can_resume=True, about=about)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -207,7 +207,7 @@ def convert_command(
         cdmisfa convert robot.mcap --topic '/camera/*' --end 1:30 -o recordings/robot
         cdmisfa convert joints.csv --field elbow --field wrist -o recordings/joints
     """
-    from cdmisfa.experiments.documents import warnings_of
+    from cdmisfa.experiments.documents import about_source
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
     from recorder.recording import record
@@ -233,8 +233,8 @@ def convert_command(
                 force=force,
             )
         printing.source_changes(frames)
-        warnings = warnings_of(frames)
-    _print_recording(output, files, as_json, warnings)
+        about = about_source(frames)
+    _print_recording(output, files, as_json, about)
     return LogDamagedError.exit_code if frames.left_out else 0
 
 
@@ -254,13 +254,21 @@ def _writing(output: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Sto
 
 
 def _print_recording(
-    folder: Path, files: Sequence[ViewRecording], as_json: bool, warnings: Sequence[str] = ()
+    folder: Path,
+    files: Sequence[ViewRecording],
+    as_json: bool,
+    about: Mapping[str, Any] | None = None,
 ) -> int:
     """Print the file of each view of a recording; return the exit code 0."""
     if as_json:
         frames = sum(file.frames for file in files if file.name == files[0].name)
         views = [file.as_json() for file in files]
-        printing.document(recording=str(folder), frames=frames, views=views, warnings=warnings)
+        printing.document(
+            recording=str(folder),
+            frames=frames,
+            views=views,
+            **(about or {"warnings": [], "notes": []}),
+        )
     else:
         rows = [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files]
         printing.table(("view", "file", "frames", "bytes", "sha256"), rows)

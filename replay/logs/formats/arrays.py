@@ -16,9 +16,10 @@ from cdmisfa.core.arrays import FloatArray, as_array
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.untrusted import BUDGET, check_regular
+from recorder.images.fields import EXACT, ROUNDED
 from recorder.images.framing import pixels_of
 from recorder.images.options import InputOptions
-from recorder.images.pixels import raw_image
+from recorder.images.pixels import ALPHA, HIGH_BYTE, losses, lost, raw_image
 from replay.logs.formats.messages import NoTopicError, fits_topic
 from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, Rows, picked
 from replay.storage.arrays import NOT_ARRAYS
@@ -80,7 +81,8 @@ def array_streams(
         raise UsageError("no array is given: give at least one")
     opened_streams = []
     for name, given in arrays.items():
-        array = _checked(str(name), given)
+        with losses() as lines:
+            array = _checked(str(name), given)
         stream = LogStream(
             path=path or Path(f"the array {name}"),
             topic=str(name),
@@ -89,6 +91,7 @@ def array_streams(
             read=partial(_frames, array, options.color is True),
             encoding="numpy",
             recipe=RECIPE,
+            warnings=[f"{path}: {line}" if path else f"{name}: {line}" for line in lines],
             digest=None if path else partial(array_hash, str(name), array),
         )
         opened_streams.append(stream)
@@ -144,6 +147,8 @@ def _frames(array: NDArray[Any], color: bool, rows: Rows) -> tuple[NDArray[Any],
     part, no_truth = picked(array, rows), np.empty((len(rows), 0))
     if part.ndim == 2:
         return part.astype(np.float64), no_truth
+    lost("floats of 0 to 1 are reduced to 8 bits", part.dtype.kind == "f")
+    lost(HIGH_BYTE, part.dtype == np.uint16)
     if part.dtype == np.uint16:
         pixels = (part >> 8).astype(np.uint8)
     else:
@@ -162,6 +167,7 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
     array = as_array(given, name)
     array = array[:, None] if array.ndim == 1 else array
     if array.ndim == 4 and array.shape[3] in (1, 4):
+        lost(ALPHA, array.shape[3] == 4)
         array = array[..., 0] if array.shape[3] == 1 else array[..., :3]
     images = array.ndim == 3 or (array.ndim == 4 and array.shape[3] == 3)
     if array.dtype.kind not in "biuf" or not (images or array.ndim == 2) or not array.size:
@@ -177,6 +183,8 @@ def _checked(name: str, given: Any) -> NDArray[Any]:
             f"{name}: {count} of {len(array)} rows have NaN or infinity, the first is row {row} "
             "(from 0): remove them"
         )
+    exact = array.ndim > 2 or array.dtype.itemsize < 8 or array.dtype.kind == "f"
+    lost(ROUNDED, not exact and (array.max() >= EXACT or array.min() <= -EXACT))
     scaled = array.dtype in (np.uint8, np.uint16, np.bool_)
     if images and not scaled and not 0 <= array.min() <= array.max() <= high:
         raise UsageError(

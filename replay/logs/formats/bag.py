@@ -20,7 +20,7 @@ from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import InputOptions
 from recorder.mcap.records import MAX_CHUNK
-from replay.logs.formats.messages import choose_topics, message_stream
+from replay.logs.formats.messages import choose_topics, left_out, message_stream
 from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, limited
 
 ENDINGS: Final = (".bag", ".db3")
@@ -111,7 +111,9 @@ def streams(
     with open_bag(path) as bag:
         kinds = [(topic, kind, topic) for topic, kind in bag.kinds().items()]
     opened_streams = []
-    for topic, kind, _ in choose_topics(path, kinds, options):
+    chosen = choose_topics(path, kinds, options)
+    notes = left_out(path, (topic for topic, _, _ in kinds), chosen, options)
+    for topic, kind, _ in chosen:
         bag = opened.enter_context(open_bag(path))  # a reader holds one chunk only
         with limited(path, "rosbags"):
             times = np.array([stamp for _, stamp in bag.stamps([topic])], np.int64)
@@ -120,7 +122,7 @@ def streams(
                 f"{path}: its messages are not in order of time; convert it to MCAP first"
             )
         fetch = bag.fetcher(topic, times)
-        about = {"program": "rosbags", "remarks": [_remark(path)]}
+        about = {"program": "rosbags", "remarks": [_remark(path)], "notes": notes}
         opened_streams.append(message_stream(path, topic, kind, options, times, fetch, **about))
     return opened_streams
 

@@ -22,7 +22,7 @@ from recorder.images.compressed import compressed_image
 from recorder.images.fields import column_names
 from recorder.images.options import RECIPE, VIDEO_RECIPE, InputOptions
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
-from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic
+from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic, left_out
 from replay.logs.formats.table import number_stream
 from replay.logs.formats.video import VideoFile
 from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, explained, limited
@@ -109,7 +109,9 @@ def streams(
             warnings=camera.dataset.notes(topic),
         )
         opened_streams.append(stream)
-    return opened_streams
+    read = [(feature,) for feature in (*chosen, *fields, *topics, *_CLOCK)]
+    notes = left_out(path, _info(path)["features"], read, options)
+    return [replace(stream, notes=notes) for stream in opened_streams]
 
 
 class _Camera:

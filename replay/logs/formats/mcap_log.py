@@ -16,7 +16,7 @@ from recorder.images.options import InputOptions
 from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Segment
-from replay.logs.formats.messages import choose_topics, message_stream
+from replay.logs.formats.messages import choose_topics, left_out, message_stream
 from replay.logs.stream import LogStream, NothingLoggedError
 from replay.storage.paths import natural_order
 
@@ -50,12 +50,14 @@ def streams(
     ]
     expected: dict[LogReader, Sequence[Segment]] = {}
     opened_streams = []
-    for topic, kind, members in choose_topics(path, channels, options):
+    chosen = choose_topics(path, channels, options)
+    notes = left_out(path, (channel[0] for channel in channels), chosen, options)
+    for topic, kind, members in chosen:
         messages, parts = Messages(members, expected), len({reader for reader, _ in members})
         joined = (
             [f"{path}: {topic} is joined from {parts} logs in order of time"] if parts > 1 else []
         )
-        left_out = [f"{error}: skipped" for error in empty]
+        skipped = [f"{error}: skipped" for error in empty]
         stream = message_stream(
             path,
             topic,
@@ -65,7 +67,8 @@ def streams(
             messages.fetch,
             memory_bytes=messages.memory_bytes,
             reader=None if path.is_dir() else readers[0],
-            warnings=[*joined, *left_out, *(w for reader in readers for w in reader.warnings)],
+            notes=notes,
+            warnings=[*joined, *skipped, *(w for reader in readers for w in reader.warnings)],
         )
         opened_streams.append(stream)
     return opened_streams

@@ -88,6 +88,15 @@ def choose_topics(
     return [(topic, *next(iter(readable[topic].values()))) for topic in chosen]
 
 
+def left_out(
+    path: Path, topics: Iterable[str], chosen: Iterable[Sequence[Any]], options: InputOptions
+) -> list[str]:
+    """Return a note on the topics that are not chosen, unless topics are asked for."""
+    others = ", ".join(sorted({*topics} - {each[0] for each in chosen}))
+    named = options.topics or options.fields or not others
+    return [] if named else [f"{path}: left out, unless named by --topic: {others}"]
+
+
 def _why_none(readable: Iterable[str], unreadable: Mapping[str, str], options: InputOptions) -> str:
     """Return the reason why no topic is chosen.
 

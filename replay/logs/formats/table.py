@@ -15,8 +15,9 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import counted
 from cdmisfa.core.untrusted import check_regular
-from recorder.images.fields import EXACT, Field, bounded, column_names, is_path
+from recorder.images.fields import EXACT, ROUNDED, Field, bounded, column_names, is_path
 from recorder.images.options import NUMBERS_RECIPE, InputOptions
+from recorder.images.pixels import losses, lost
 from replay.logs.formats.messages import check_topics
 from replay.logs.stream import LAST_NS, ChannelInfo, ExternalChannel, LogStream, limited, picked
 
@@ -155,9 +156,10 @@ def number_stream(
         if late := int((times[rows] < np.maximum.accumulate(times[rows])).sum()):
             lines.append(f"{late} rows are out of order: rows are sorted by time")
         rows = rows[np.argsort(times[rows], kind="stable")]
-    frames = bounded(numbers, options.range)[rows]
-    if (np.abs(frames) > EXACT).any():
-        lines.append("numbers above 2^53 may be rounded to float64")
+    with losses() as changed:
+        frames = bounded(numbers[rows], options.range)
+        lost(ROUNDED, (np.abs(frames) >= EXACT).any())
+    lines += changed
     return LogStream(
         path=path,
         topic=topic,

@@ -103,6 +103,8 @@ class VideoFile:
             raise
         self.memory_bytes = data_bytes() - before
         self.warnings = [self.missing] if self.missing else []
+        if (tracks := len(self._container.streams.video)) > 1:
+            self.warnings.append(f"it has {tracks} video tracks: only the first is read")
         self.remarks = ["a video has no checksums, so damaged pixels may be undetected"]
         if not self.missing and not extent.stated:
             self.remarks.append("it does not state its length, so a missing end cannot be detected")
