@@ -34,7 +34,6 @@ REFUSED = {
     "learn a.mcap --topic /cam_* --rate 25": "50 images per second, not 25",
     "learn a.mcap --topic /cam_* --start 12 --end 5": "--end 5 is before --start 12",
     "learn uneven.mcap --topic /cam_*": "align them by time with --align time --rate 50",
-    "view t.csv uneven.mcap --set input.time=s --save v": "have 1 number and images",
     "view apart.mcap --save v.rrd": ("the streams do not overlap in time: choose one with --topic"),
     "learn joints.mcap": NO_IMAGES,
     "view joints.mcap --save v.rrd": "it has no images",

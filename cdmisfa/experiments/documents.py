@@ -44,7 +44,7 @@ def warnings_of(source: object) -> list[str]:
 
 
 def notes_of(source: Any) -> list[str]:
-    """Return how the images of a source become frames, and what it usually leaves out."""
+    """Return how the images of a source become frames, and which topics are left out."""
     framings = zip(source.spec.streams, getattr(source, "framings", ()), strict=False)
     changed = [f"{name}: {framing}" for name, framing in framings if "," in str(framing)]
     return [*getattr(source, "notes", ()), *changed]

@@ -68,7 +68,7 @@ class LogStream:
         fields: fields that are read instead of images, in order.
         columns: returns the name of each number of a row.
         warnings: lines to print for the user.
-        notes: lines on what is usually left out.
+        notes: lines on topics that are left out.
         remarks: a line for each property that the format cannot guarantee, as without checksums.
         missing: the missing part of a truncated file, or "".
         reader: the MCAP file, if all rows are in one.

@@ -92,9 +92,9 @@ def left_out(
     path: Path, topics: Iterable[str], chosen: Iterable[Sequence[Any]], options: InputOptions
 ) -> list[str]:
     """Return a note on the topics that are not chosen, unless topics are asked for."""
-    others = ", ".join(sorted({*topics} - {each[0] for each in chosen}))
-    named = options.topics or options.fields or not others
-    return [] if named else [f"{path}: left out, unless named by --topic: {others}"]
+    absent = ", ".join(sorted({*topics} - {each[0] for each in chosen}))
+    named = options.topics or options.fields or not absent
+    return [] if named else [f"{path}: left out, unless named by --topic: {absent}"]
 
 
 def _why_none(readable: Iterable[str], unreadable: Mapping[str, str], options: InputOptions) -> str:
