@@ -90,6 +90,8 @@ class WatchEnv(Env):
         shape: tuple[int, ...] = (first.tau, len(first.phi))
         pixels = False
         if observe == "block":
+            if spec.kinds:
+                raise UsageError('the streams differ in shape: set observe="outputs"')
             shape, pixels = (first.tau, *spec.frame_shape), spec.dtype == "uint8"
         low, high, dtype = (0, 255, np.uint8) if pixels else (-np.inf, np.inf, np.float64)
         self.observation_space = Box(low, high, shape, dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Keyframe
+from cdmisfa.watching import WatchEnv
 from recorder.images.messages import MessageKind
 from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.log import read_header
@@ -137,6 +139,15 @@ def test_the_papers_learners_refuse_streams_of_several_kinds() -> None:
     for algorithm in ("2.0", "1.0"):
         with pytest.raises(UsageError, match=f"learner {algorithm} takes one kind: add --algor"):
             learn(arrays(200), algorithm=algorithm, view=False)
+
+
+def test_an_environment_observes_only_the_outputs_of_such_a_source() -> None:
+    with pytest.raises(UsageError, match="the streams differ in shape: set observe="):
+        WatchEnv(Recording(arrays(200)).source())
+    with contextlib.closing(WatchEnv(Recording(arrays(200)).source(), observe="outputs")) as env:
+        env.reset(seed=0)
+        for stream in (0, 1):
+            assert env.observation_space.contains(env.step(stream)[0])
 
 
 def test_the_json_of_sources_of_one_kind_has_no_kinds(tmp_path: Path) -> None:

@@ -15,13 +15,7 @@ import numpy as np
 from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray, FloatArray, as_array, without_table
-from cdmisfa.core.blocks import (
-    Block,
-    ForwardSource,
-    SourceSpec,
-    check_request,
-    freeze,
-)
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from cdmisfa.core.gaps import stretches

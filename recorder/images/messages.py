@@ -26,14 +26,7 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, needs, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.compressed import compressed_image, compressed_words
-from recorder.images.fields import (
-    EVERY,
-    Field,
-    field_value,
-    members,
-    number_paths,
-    numbers_of,
-)
+from recorder.images.fields import EVERY, Field, field_value, members, number_paths, numbers_of
 from recorder.images.options import Depth, InputOptions
 from recorder.images.pixels import DISTANCES, Content, MalformedImage, raw_image
 from recorder.images.videos import Packet, VideoPackets
@@ -287,12 +280,6 @@ def options_for(topic: str, kind: MessageKind, options: InputOptions) -> InputOp
         return options
     fields = () if kind[:2] in _CONTENT else options.fields or EVERY
     return replace(options, fields=fields)
-
-
-def every_field(kind: MessageKind, data: Data) -> tuple[str, ...]:
-    """Return the fields with numbers of a message; () if its kind is unknown."""
-    decode = message_decoder(kind)
-    return () if decode is None else tuple(number_paths(decode(bytes(data))))
 
 
 def stated_format(schema: str, encoding: str, data: Data) -> str:

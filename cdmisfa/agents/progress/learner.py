@@ -114,8 +114,7 @@ class ProgressLearner:
         """(J, I) weights of the candidate of the next stream, a copy."""
         candidate = self._candidates.get(self.stream)
         if candidate is None:
-            size = self._kinds.inputs(self.stream).size
-            return np.zeros((min(self.config.outputs, size), size))
+            return np.zeros((self._n_outputs, self._kinds.inputs(self.stream).size))
         return candidate.sfa.phi
 
     @property

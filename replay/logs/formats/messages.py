@@ -13,13 +13,13 @@ import numpy as np
 
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.fields import EVERY, column_names
+from recorder.images.fields import EVERY, column_names, number_paths
 from recorder.images.messages import (
     PACKED,
     SCHEMAS,
     MessageKind,
     decoder_of,
-    every_field,
+    message_decoder,
     options_for,
     packed_image,
     stamp_of,
@@ -145,11 +145,13 @@ def message_stream(
     options = options_for(topic, kind, options)
     warnings = list(about.pop("warnings", ()))
     if options.fields == EVERY:
+        decode_whole = message_decoder(kind)
         try:
-            fields = every_field(kind, fetch(0)) if len(times) else EVERY
+            first = bytes(fetch(0)) if len(times) else None
+            paths = number_paths(decode_whole(first)) if decode_whole and first else EVERY
+            options = replace(options, fields=tuple(paths))
         except (MalformedRecord, MalformedImage) as error:
             raise LogDamagedError(f"{path}: {topic}: {error}") from None
-        options = replace(options, fields=fields)
         if not options.fields:
             raise UsageError(f"{path}: {topic} has {kind.schema}, with neither images nor numbers")
         warnings.append(f"{path}: {topic} is read as its numbers {', '.join(options.fields)}")
