@@ -293,7 +293,7 @@ class StoredSource(ClockedSource):
         while at < n:  # an episode ends where a lap does
             place = (t + at - self.first_frame) % self.lap
             count = min(n - at, self.frames - place)
-            mean = self._mean(stream, self.first_frame + place)
+            mean = self._mean(stream, t + at)
             parts.append(centred(block.frames[at : at + count], mean))
             at += count
         frames = parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -302,12 +302,12 @@ class StoredSource(ClockedSource):
     def _mean(self, stream: int, t: int) -> NDArray[Any]:
         """Return the mean of the episode of a frame, for which all of it is read."""
         self._means = self._means or {}
-        span = self.episode(stream, t)
+        span, lap = self.episode(stream, t), (t - self.first_frame) // self.lap * self.lap
         known = self._means.get(stream)
         if known is None or known[0] != span:
             pieces = (
                 self._block(stream, at, min(PIECE, high - at)).frames
-                for low, high in self.spans(stream, *span)
+                for low, high in self.spans(stream, span[0] + lap, span[1] + lap)
                 for at in range(low, high, PIECE)
             )
             self._means[stream] = known = span, mean_of(pieces)

@@ -178,6 +178,28 @@ def test_a_log_damaged_in_the_middle_is_left_out_from_there_on(
     assert "this log is skipped" in without.err
 
 
+def test_each_pass_over_a_damaged_log_ends_at_the_damage(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    folder = corpus(cdmisfa, tmp_path / "logs", scenes(2, 60))
+    damaged = folder / "ep0.mcap"
+    flip(damaged, damaged.stat().st_size // 2)
+    paths = damaged, folder / "ep1.mcap"
+    with opened(*paths) as source, opened(*paths) as resumed:
+        first: list[int] = []
+        for one in (source, resumed):
+            one.repeat(2)
+        while source.t < source.lap:
+            source.seek(source.t + 3)  # as if streams took turns
+            first.append(source.take(0, 10).t)
+        assert source.left_out
+        resumed.seek(source.lap)
+        source.seek(source.lap)
+        for _ in range(6):
+            a, b = source.take(0, 10), resumed.take(0, 10)
+            assert a.t == b.t
+            np.testing.assert_array_equal(a.frames, b.frames)
+        assert source.left_out == resumed.left_out
+
+
 # Stopped and resumed
 
 

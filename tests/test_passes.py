@@ -73,7 +73,30 @@ def test_a_short_log_is_repeated_until_it_is_decided(cdmisfa: Cdmisfa, tmp_path:
 def test_passes_are_for_logs_that_end(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     np.save(tmp_path / "log.npy", values(200))
     for words in (("oscillatory",), (tmp_path / "log.npy", "--loop")):
-        refused = cdmisfa("learn", *words, "--passes", 3)
+        refused = cdmisfa("learn", *words, "--passes", 1)
         assert (refused.code, "--passes" in refused.err) == (2, True)
     with pytest.raises(UsageError, match="passes"):
         package.learn(iter(values(200)), passes=2)
+    with pytest.raises(UsageError, match="passes"):
+        package.learn("oscillatory", passes=1)
+
+
+def test_an_undecided_run_is_continued_with_more_passes(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log, run, fork = tmp_path / "log.npy", tmp_path / "run", tmp_path / "fork"
+    np.save(log, values(1000))
+    whole = cdmisfa("learn", log, "--json").json
+    once = cdmisfa("learn", log, "--passes", 1, "-o", run, "--no-rerun")
+    more = f"continue with cdmisfa learn --resume --passes 20 -o {run}"
+    assert once.err.splitlines()[-1] == f"log not decided: {more}"
+    resumed = cdmisfa("learn", "--resume", "--passes", 20, "-o", run, "--json", "--no-rerun")
+    assert resumed.json["signals_sha256"] == whole["signals_sha256"]
+    limit = ("--max-iterations", whole["iterations"] - 20)
+    at = whole["iterations"] - 30
+    cdmisfa("fork", run, "--iteration", at, "-o", fork, "--no-rerun", *limit)
+    words = ("learn", "--resume", "-o", fork, "--max-iterations", 9999, "--json", "--no-rerun")
+    assert cdmisfa(*words).json["signals_sha256"] == whole["signals_sha256"]
+    cdmisfa("sweep", log, "--seeds", "0", "-o", tmp_path / "sweep", "--jobs", 1)
+    (trial,) = map(json.loads, (tmp_path / "sweep" / "rows.jsonl").read_text().splitlines())
+    assert trial["result"]["modules"] == whole["modules"]
+    refused = cdmisfa("learn", tmp_path / "missing.npy", "-o", run)
+    assert "exists" in refused.err  # before the source is opened

@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,7 +44,8 @@ class Episode:
         turns: see `cdmisfa.core.blocks.turn_to`.
         streams: for each stream its framing, its fields, and its pixel format.
         start: its first frame on the clock of all.
-        whole: number of frames before damage.
+        whole: number of frames before damage, for each lap in which damage was read. A resumed run
+            does not know of the damage in earlier laps, and must read the same frames.
     """
 
     log: Log
@@ -60,16 +61,18 @@ class Episode:
     turns: Sequence[Sequence[int]]
     streams: Mapping[str, tuple[Any, list[str], str]]
     start: int = 0
-    whole: int = 0
+    whole: dict[int, int] = field(default_factory=dict)
 
-    def spans(self, stream: str) -> Iterator[Span]:
-        """Yield the unbroken stretches of a stream on the clock of all."""
+    def spans(self, stream: str, lap: int = -1) -> Iterator[Span]:
+        """Yield the unbroken stretches of a stream on the clock of all, in a lap up to damage."""
         if stream not in self.spec.streams:
             return
         frames = ((self.first, self.first + self.count),)
         for low, high in self.ranges[self.spec.streams.index(stream)] if self.ranges else frames:
             start, end = (self.start + t - self.first for t in (low, high))
-            if start < (end := min(end, self.start + self.whole)):
+            if lap in self.whole:
+                end = min(end, self.start + self.whole[lap])
+            if start < end:
                 yield start, end
 
 
@@ -154,7 +157,6 @@ def episode_of(
         stated=stated,
         turns=source.turns,
         streams=streams,
-        whole=source.frames,
     )
 
 

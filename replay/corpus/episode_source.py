@@ -222,7 +222,7 @@ class EpisodeSource(StoredSource):
                 episode = self._episodes[i]
                 if lap * self.lap + episode.start >= stop:
                     return
-                for low, high in episode.spans(name):
+                for low, high in episode.spans(name, lap):
                     low, high = low + lap * self.lap, high + lap * self.lap
                     if max(low, start) < min(high, stop):
                         yield max(low, start), min(high, stop)
@@ -233,7 +233,7 @@ class EpisodeSource(StoredSource):
     def _block(self, stream: int, t: int, n: int) -> Block:
         place = t % self.lap
         number = bisect.bisect_right(self._starts, place) - 1
-        self._reading = number, place
+        self._reading = number, t
         episode, source = self._episodes[number], self._log(number)
         source.seek(place - episode.start + episode.first)
         block = source.take(episode.spec.streams.index(self._spec.streams[stream]), n)
@@ -264,13 +264,17 @@ class EpisodeSource(StoredSource):
         return open_log(log, self._inputs, skip_damaged=self._skip_damaged)
 
     def _leave_out(self, error: LogDamagedError) -> None:
-        """Skip a damaged log from the current block on."""
+        """Skip a damaged log from the current block on, to the end of the lap."""
         number, t = self._reading
         episode = self._episodes[number]
-        episode.whole = 0 if self.centre == "episode" else min(t - episode.start, episode.whole)
-        rest = "the rest of this log is" if episode.whole else "this log is"
-        self._lost.append(f"{error}: {rest} skipped")
-        self.left_out = (*self.left_out, self._lost[-1])
+        lap, place = divmod(t, self.lap)
+        whole = 0 if self.centre == "episode" else place - episode.start
+        episode.whole[lap] = whole
+        rest = "the rest of this log is" if whole else "this log is"
+        line = f"{error}: {rest} skipped"
+        if line not in self._lost:
+            self._lost.append(line)
+            self.left_out = (*self.left_out, line)
 
     def _logs(self) -> Sequence[Identity]:
         return [episode.identity for episode in self._episodes]

@@ -176,8 +176,8 @@ def _opened_source(
     passes = arguments.pop("passes")
     if unused and (live or is_scene(words)):
         raise UsageError(f"{words[0]} is no log: {are_for(unused, 'logs')}")
-    for folder in filter(None, (output, record_to) if live else ()):
-        refuse_existing(folder, force=force, resumable=False)
+    for folder in filter(None, () if arguments["resumed"] else (output, record_to)):
+        refuse_existing(folder, force=force, resumable=not live)
     with bar("opening", "logs") as progress_bar:
         frames, configuration = open_source(
             words, progress=progress_bar.update, say=printing.status, **arguments
