@@ -152,6 +152,8 @@ def test_incsfa_warns_if_and_only_if_its_output_is_not_the_slowest_feature() -> 
         ({"window": None}, np.ones((9, 2)), "window is None"),
         ({}, np.full((9, 2), 1e200), "holds 1e[+]200, above the limit of 1e[+]100: scale it"),
         ({}, np.full((9, 2), np.nan), "contains NaN"),
+        ({}, [[1.0, None]] * 9, "contains NaN"),
+        ({}, np.zeros((9, 2), "M8[s]"), "X has type datetime64.s.: give times as numbers"),
     ],
 )
 def test_what_cannot_be_learned_is_refused(
@@ -159,6 +161,9 @@ def test_what_cannot_be_learned_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         make(**parameters).fit(X)
+    if not parameters and not np.array_equal(X, np.full((9, 2), 1e200)):
+        with pytest.raises(ValueError, match=message):
+            make().fit(waves(9, 2)).transform(X)
 
 
 def samples(X: NDArray[np.float64]) -> list[dict[str, float]]:

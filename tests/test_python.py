@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import os
 import signal
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+import scipy.sparse
 from conftest import Cdmisfa
 from contracts.sources import SourceContract
 
@@ -110,6 +112,7 @@ def test_pictures_of_any_type_are_the_same_frames() -> None:
             r"cam: .* np.moveaxis\(x, 1, -1\) moves the colors to the end",
         ),
         (1000 * numbers().reshape(-1, 4, 5), "scale them to 0 to 1"),
+        ({"a": scipy.sparse.eye(400)}, "a: the array is sparse: give it as x.toarray"),
         (["one", 2], "shape .* of <U21 is not supported: use"),
         (np.zeros((0, 3)), "shape .0, 3. of float64 is not supported: use"),
         ("nowhere.npz", "no such file"),
@@ -190,6 +193,9 @@ def test_parts_of_a_temporary_run_outlive_it(
         lambda run: run.frames(0, 2).shape == kept.frames(0, 2).shape,
         lambda run: run.at(3).iteration == 3,
         lambda run: run.report,
+        lambda run: copy.copy(run.signals).to_arrow,
+        lambda run: copy.deepcopy(run).signals.to_arrow,
+        lambda run: copy.deepcopy(run).frames,
     ):
         part = use(learn(numbers(), **FEW))
         gc.collect()

@@ -16,7 +16,7 @@ CEILINGS = {
     "cdmisfa/agents": 1195,
     "cdmisfa/cli": 2160,
     "cdmisfa/core": 1140,
-    "cdmisfa/estimators": 245,
+    "cdmisfa/estimators": 250,
     "cdmisfa/experiments": 2290,
     "cdmisfa/features": 230,
     "cdmisfa/kernels": 2390,

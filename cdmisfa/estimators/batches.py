@@ -150,7 +150,12 @@ class _SlowFeatures(_Estimator):
 
     def _checked(self, X: Any, **options: Any) -> Any:
         refuse_masked(X, "X")
-        return validate_data(self, X, dtype="numeric", **options)
+        if isinstance(X, list | tuple):  # scikit-learn passes None in lists, but not in arrays
+            X = np.asarray(X)
+        X = validate_data(self, X, dtype="numeric", **options)
+        if X.dtype.kind in "mM":
+            raise ValueError(f"X has type {X.dtype}: give times as numbers, or leave them out")
+        return X
 
     def _check(self, n_features: int) -> None:
         sizes = {"n_components": self.n_components, "n_whitened": self.n_whitened}

@@ -27,7 +27,7 @@ from cdmisfa.experiments.sources import (
     read_inputs,
 )
 from cdmisfa.public.recording import Recording, SourceLike, as_words
-from cdmisfa.public.run import Run
+from cdmisfa.public.run import Run, TemporaryFolder
 from recorder.images.options import OPTIONS, Centre, InputOptions
 from replay.logs.source import LoggedSource
 from replay.stored_source import centre_as
@@ -67,7 +67,8 @@ def learn(
             of a scene ("oscillatory", "icub"); live streams ("camera:/dev/video0",
             "gym:CartPole-v1"); an iterable of time steps (see `ArraySource`); or an open source,
             which stays open.
-        out: folder of the run; None: a temporary folder, removed with the returned object.
+        out: folder of the run; None: a temporary folder, removed with the returned object and its
+            copies. A run that is pickled for later needs a folder.
         algorithm: "2.0" (default for scenes), "progress" (default for other streams), "1.0", or
             a class as "package.module:Class".
         seed: seed of random choices, scenes and simulated tasks.
@@ -129,8 +130,8 @@ def learn(
         if command is None and isinstance(frames, LoggedSource) and frames.in_memory:
             run._source = Recording.of(source)  # the folder has only hashes of arrays
         if out is None:
-            # The run refers to its signals, which read the folder and can outlive it.
-            weakref.finalize(run.signals, shutil.rmtree, folder.parent, ignore_errors=True)
+            run.signals._folder = TemporaryFolder()
+            weakref.finalize(run.signals._folder, shutil.rmtree, folder.parent, ignore_errors=True)
     return run
 
 
@@ -215,7 +216,7 @@ def _opened(
 def _is_computed(source: Any) -> bool:
     """Return whether frames come one after the other, from an iterator or an own source."""
     whole = isinstance(source, Collection) or hasattr(source, "__arrow_c_stream__")
-    return isinstance(source, Iterable) and not whole
+    return isinstance(source, Iterable) and not whole and not hasattr(source, "toarray")
 
 
 def _configured(

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,13 @@ class UnknownSignalError(UsageError, KeyError):
     __str__ = Exception.__str__  # KeyError would print the message in quotes
 
 
+class TemporaryFolder:
+    """Mark of a run in a temporary folder, which is removed with the last object that holds it."""
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self
+
+
 class Signals(Described, Mapping[str, "NDArray[Any]"]):
     """The signals of a run: arrays by name, and tables with one row for each iteration.
 
@@ -42,6 +49,7 @@ class Signals(Described, Mapping[str, "NDArray[Any]"]):
     def __init__(self, log: Path, header: RunHeader) -> None:
         self._log, self._header = log, header
         self._arrays: dict[str, NDArray[Any]] = {}
+        self._folder: TemporaryFolder | None = None
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         _refuse_unknown(name)
