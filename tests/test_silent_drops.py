@@ -131,7 +131,7 @@ def video(form: str, tracks: int = 1) -> Write:
             for stream in streams:
                 stream.width, stream.height, stream.pix_fmt = 16, 12, form
             for stream in streams:
-                for image in ramp(3):
+                for image in ramp(3) * np.array([1, 1, 0], np.uint8):
                     frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=form)
                     container.mux(stream.encode(frame))
                 container.mux(stream.encode())

@@ -24,7 +24,7 @@ CEILINGS = {
     "cdmisfa/studies": 940,
     "recorder": 350,
     "recorder/cameras": 870,
-    "recorder/images": 1113,
+    "recorder/images": 1118,
     "recorder/log": 1320,
     "recorder/mcap": 1570,
     "recorder/world": 1410,

@@ -69,7 +69,8 @@ def losses() -> Iterator[list[str]]:
 
 def lost(line: str, when: object = True) -> None:
     """State a loss of the image that is decoded, on a condition, to `losses`."""
-    if when and (lines := _losses.get()) is not None:
+    lines = _losses.get()
+    if lines is not None and (when() if callable(when) else when):
         lines.append(line)
 
 

@@ -40,13 +40,20 @@ _UNIT: Final = re.compile(b"\0\0\1(.)", re.DOTALL)
 
 def frame_gray(frame: Any) -> ByteArray:
     """Return the luma of a PyAV frame, or the gray of its colors, upright, (height, width)."""
-    lost(GRAY, not frame.format.name.startswith("gray"))
+    lost(GRAY, lambda: _has_colors(frame))
     return _upright(_luma(frame), frame)
 
 
 def frame_colors(frame: Any) -> ByteArray:
     """Return the colors of a PyAV frame, upright, (height, width, 3); its luma if it has none."""
     return _upright(_colors(frame), frame)
+
+
+def _has_colors(frame: Any) -> bool:
+    """Return whether the chroma of a frame is not neutral."""
+    if not _is_planar(frame, "yuv"):
+        return not frame.format.name.startswith("gray")
+    return any((_plane(p, p.height, p.width) != 128).any() for p in frame.planes[1:3])
 
 
 def _upright(pixels: ByteArray, frame: Any) -> ByteArray:
