@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import isnan
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cdmisfa.agents.learners import learner_class, open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, turn_to
 from cdmisfa.core.config import build, load_preset
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, UsageError, missing_base
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import BlockSignals
 
@@ -20,12 +20,7 @@ try:
     from gymnasium.error import ResetNeeded
     from gymnasium.spaces import Box, Discrete
 except ImportError:
-
-    class Env:  # type: ignore[no-redef]
-        def __new__(cls, *_: Any, **__: Any) -> Self:
-            raise UsageError(
-                f"{cls.__name__} needs Gymnasium, which is missing: pip install 'cdmisfa[gym]'"
-            )
+    Env = missing_base("gymnasium", "'cdmisfa[gym]'")  # type: ignore[misc]
 
 
 class WatchEnv(Env):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Entry = TypeVar("Entry")
 
@@ -68,6 +68,16 @@ def needs(user: object, package: str, remedy: str = "") -> Iterator[None]:
         raise MissingPackageError(
             f"{user}: needs the package {package} (pip install {remedy or package})"
         ) from None
+
+
+def missing_base(package: str, remedy: str) -> Any:
+    """Return a base of classes that need a missing package: creating an object raises `needs`."""
+
+    def refuse(cls: type, *_: object, **__: object) -> None:
+        with needs(cls.__name__, package, remedy):
+            raise ImportError
+
+    return type("Missing", (), {"__new__": refuse})
 
 
 def are_for(options: Sequence[str], purpose: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from cdmisfa.agents.inputs import LARGEST_VALUE
 from cdmisfa.core.arrays import FloatArray, refuse_masked
 from cdmisfa.core.config import MAX_COMPONENTS, LearnerConfig
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import missing_base
 from cdmisfa.features.incsfa import IncrementalFeature
 from cdmisfa.features.outputs import project
 from cdmisfa.features.recursive import PIECE, RecursiveFeature
@@ -26,22 +26,16 @@ try:
     from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.utils.validation import check_is_fitted, check_random_state, validate_data
-except ImportError:
 
-    class _Estimator:
-        def __new__(cls, *_: Any, **__: Any) -> Self:
-            raise UsageError(
-                f"{cls.__name__} needs scikit-learn, which is missing: "
-                "pip install 'cdmisfa[sklearn]'"
-            )
-else:
-
-    class _Estimator(  # type: ignore[no-redef]
+    class _Estimator(
         ClassNamePrefixFeaturesOutMixin,  # type: ignore[misc]
         TransformerMixin,  # type: ignore[misc]
         BaseEstimator,  # type: ignore[misc]
     ):
         pass
+
+except ImportError:
+    _Estimator = missing_base("scikit-learn", "'cdmisfa[sklearn]'")  # type: ignore[misc]
 
 
 # Samples that are converted to float64 at once. It is a multiple of the pieces in which
@@ -72,7 +66,7 @@ class _SlowFeatures(_Estimator):
         Raises:
             ValueError: X or a parameter is not valid.
         """
-        vars(self).pop("_feature", None)
+        self.__dict__.pop("_feature", None)
         return self._learn(X, False, fewest=2)
 
     def partial_fit(self, X: Any, y: Any = None, *, gap: bool = False) -> Self:

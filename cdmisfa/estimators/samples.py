@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import nan
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from cdmisfa.agents.inputs import LARGEST_VALUE
 from cdmisfa.core.arrays import FloatArray, refuse_masked
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import UsageError, missing_base
 from cdmisfa.features.outputs import project
 from cdmisfa.features.recursive import RecursiveFeature
 from cdmisfa.kernels import mean_output
@@ -18,12 +18,7 @@ from cdmisfa.kernels import mean_output
 try:
     from river.base import Transformer
 except ImportError:
-
-    class Transformer:  # type: ignore[no-redef]
-        def __new__(cls, *_: Any, **__: Any) -> Self:
-            raise UsageError(
-                f"{cls.__name__} needs river, which is missing: pip install 'cdmisfa[river]'"
-            )
+    Transformer = missing_base("river", "'cdmisfa[river]'")
 
 
 class OnlineSFA(Transformer):  # type: ignore[misc]

@@ -75,12 +75,7 @@ def report_all(
             failures.append(failed(word, error))
     alone = len(words) == len(places) == 1
     for place in places:
-        try:
-            reports += read(place, alone)
-        except CdmisfaError as error:
-            if alone:
-                raise
-            reports.append(failed(place, error))
+        reports += read(place, alone)
     path = " ".join([*map(str, places), *(report.path for report in failures)])
     return combined(path, reports + failures)
 

@@ -71,15 +71,14 @@ def each_report(
         alone: raise the error of the only log instead of reporting it.
 
     Raises:
-        UsageError: no such file or folder, or it has no log.
+        CdmisfaError: the only log cannot be read, or there is none.
     """
-    if not place.exists():
-        raise no_such(place)
     logs = list(find_logs([place])) if place.is_dir() else [ListedLog(str(place))]
-    if not logs:
-        raise UsageError(f"{place}: no log is in this folder or below it")
+    logs = logs or [ListedLog(str(place), problem="no log is in this folder or below it")]
     for log in logs:
         try:
+            if not place.exists():
+                raise no_such(place)
             if log.problem:
                 raise UsageError(f"{log.file}: {log.problem}")
             yield read(Path(log.file))

@@ -43,10 +43,10 @@ from replay.storage.location import location
 
 def check_logs(*words: str | Path) -> LogReport:
     """Check several logs, each by itself; see `check_log`, which raises where there is one."""
-    return report_all(words, lambda place, alone: [check_log(place)])
+    return report_all(words, lambda place, alone: [check_log(place, alone)])
 
 
-def check_log(path: str | Path) -> LogReport:
+def check_log(path: str | Path, alone: bool = True) -> LogReport:
     """Check a log, or all logs of a folder, by decoding everything in them, in one pass of each.
 
     A run is compared with its final record: its signals and, in its folder, the files beside its
@@ -54,8 +54,7 @@ def check_log(path: str | Path) -> LogReport:
     same frames and none may be missing. Every image of a camera log is decoded.
 
     Raises:
-        UsageError: no such log.
-        CdmisfaError: a package that reads it is missing.
+        CdmisfaError: `alone`, and the only log cannot be read.
     """
     place = location(path)
     views: dict[Path, list[_ViewContent]] = {}
@@ -68,7 +67,7 @@ def check_log(path: str | Path) -> LogReport:
             views.setdefault(file.parent, []).append(content)
         return report
 
-    reports = list(each_report(place, check))
+    reports = list(each_report(place, check, alone))
     checks = [_check_views(contents, alone=place.is_file()) for contents in views.values()]
     return combined(str(place), reports, itertools.chain(*checks))
 
