@@ -52,7 +52,8 @@ attacks: $(TESTED)
 sanitized: $(TESTED)
 	CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" $(BIN)/python setup.py -q \
 	    build --build-base $(SANITIZED) --build-lib $(SANITIZED)/lib
-	LD_PRELOAD="$$(gcc -print-file-name=libasan.so)" ASAN_OPTIONS=detect_leaks=0 \
+	LD_PRELOAD="$$(gcc -print-file-name=libasan.so)" \
+	ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 \
 	    $(BIN)/pytest -q -o "pythonpath=$(SANITIZED)/lib ." $(wildcard tests/test_kernels*.py) \
 	    tests/test_incsfa.py tests/test_recursive_sfa.py tests/test_chunks.py
 

@@ -18,6 +18,7 @@ from typing import Any
 import hypothesis
 import pytest
 from ignored_signals import let_children_be_signalled
+from waiting import listens, wait_for
 
 MEMORY, ROOM = Path("/dev/shm"), 6 << 30
 if "TMPDIR" not in os.environ and MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
@@ -141,6 +142,7 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]
         options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
         started.append(subprocess.Popen([*dask, "worker", address, *options], **quiet))
     try:
+        wait_for(lambda: listens(int(port)), seconds=60)
         yield address, started[1:]
     finally:
         for process in started:

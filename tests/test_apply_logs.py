@@ -19,7 +19,7 @@ from applied_data import camera, make_run
 from camera_files import pictures
 from conftest import Cdmisfa
 from engine_tasks import apply_or_die
-from waiting import running, started, wait_for
+from waiting import listens, running, started, wait_for
 
 from cdmisfa import Run
 from cdmisfa.core.processes import WorkersError
@@ -303,6 +303,7 @@ def test_workers_of_a_dask_cluster_apply_and_sweep(
             f"worker {address} --nthreads 1 --nworkers 2",
         ):
             ended.enter_context(running("-m", "dask", *words.split(), "--no-dashboard"))
+        wait_for(lambda: listens(int(port)), seconds=60)
         for words in (
             "apply runs/cameras sample_logs/ic* -o applied/there",
             "sweep oscillatory --seeds 0:2 --max-modules 1 -o sweeps/there",

@@ -13,7 +13,9 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.learning import Keyframe, LearnerState
 from cdmisfa.modules import Module
+from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
 
 EASY = {"delta": 1.0, "eta_dot_window": 3, "min_variance": 0.0, "warm_up": 0, "tau": 20}
@@ -97,6 +99,35 @@ def test_a_file_of_something_else_is_refused_in_words(data: bytes, tmp_path: Pat
         load_modules(tmp_path)
     with pytest.raises(UsageError, match="does not exist"):
         load_modules(tmp_path / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("stream_index", np.array(value)) for value in (-1, 0.0, "a", [0, 0])),
+        *(("phi", value) for value in (np.full((1, 6), np.nan), np.zeros((0, 6)), np.ones((1, 5)))),
+        *(("mean", value) for value in (np.full(6, np.inf), np.zeros((6, 1)), np.zeros(7))),
+        *(("scale", np.array(value)) for value in (np.nan, [1.0, 1.0])),
+        *(("frame_shape", np.array(value)) for value in ([-2, -3], [0, 6], [2, 2], 6, [np.inf])),
+        *(("policy", value) for value in (np.array(0), np.zeros((1, 1)))),
+        *(("iteration", np.array(-1)), ("slow", np.zeros(2)), ("eta", np.zeros(0))),
+        *(("counts", np.zeros((1, 1))), ("phi", np.array([b"a"])), ("recipe", np.array("[1]"))),
+    ],
+)
+def test_a_module_is_refused_if_a_value_does_not_fit(
+    name: str, value: np.ndarray[Any, Any], tmp_path: Path
+) -> None:
+    module = with_width(6, frame_shape=(2, 3))
+    save_modules(tmp_path / "modules.npz", [module])
+    arrays = dict(np.load(tmp_path / "modules.npz"))
+    assert load_modules(tmp_path)[0].frame_shape == (2, 3)
+    np.savez(tmp_path / "modules.npz", **{**arrays, f"module1_{name}": value})
+    with pytest.raises(LogDamagedError, match=r"modules\.npz is not a file of modules"):
+        load_modules(tmp_path)
+    if name in ("phi", "mean", "policy") and value.dtype.kind == "f":
+        state = LearnerState({}, (replace(module, **{name: value}),), {})
+        with pytest.raises(LogDamagedError, match="not a keyframe"):
+            decode_keyframe(encode_keyframe(Keyframe(1, 1, state, {})))
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import pytest
 from engine_tasks import die_while_sending, sleep_for, trace
 from waiting import wait_for
 
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.processes import WORKER_ENVIRONMENT, WorkersError, run_all, workers
 
 SCRIPT = """
@@ -108,3 +111,28 @@ def test_every_task_is_computed_once(tmp_path: Path, jobs: int) -> None:
     assert sorted(run_all(trace, tasks, jobs=jobs)) == [(n, n * n) for n in range(20)]
     assert {file.stat().st_size for file in tmp_path.iterdir()} == {1}
     assert list(run_all(trace, [], jobs=jobs)) == []
+
+
+@pytest.mark.parametrize(
+    ("greeting", "message"),
+    [(None, "no answer within"), (b"HTTP/1.1 400 Bad Request", "another program answers")],
+)
+def test_a_server_that_is_no_scheduler_is_refused(
+    greeting: bytes | None, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    if greeting is None:
+        monkeypatch.setattr("cdmisfa.core.processes.CONNECT_SECONDS", 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            with server.accept()[0] as connection:
+                connection.sendall(greeting or b"")
+
+        if greeting:
+            threading.Thread(target=answer, daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(UsageError, match=f"no dask cluster at {address}: {message}"):
+            list(run_all(abs, [1, 2], scheduler=address))
+    with pytest.raises(UsageError, match="no dask cluster at foo://1: unknown address scheme"):
+        list(run_all(abs, [1, 2], scheduler="foo://1"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib
 import itertools
@@ -20,7 +21,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from cdmisfa.core.errors import CdmisfaError, needs, one_line
+from cdmisfa.core.errors import CdmisfaError, UsageError, needs, one_line
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -28,8 +29,8 @@ Result = TypeVar("Result")
 # Calls a function with arguments in a worker.
 Submit = Callable[..., Future[Any]]
 
-# Seconds that a dask scheduler and its first worker may take to answer.
-CONNECT_SECONDS = 15
+# Seconds that a dask scheduler may take to answer, and then its first worker.
+CONNECT_SECONDS, WORKER_SECONDS = 6, 15
 
 # Tasks that a cluster has at a time: more than its workers, and few enough to submit quickly.
 MAX_SUBMITTED = 1000
@@ -68,7 +69,8 @@ def run_all(
 
     Raises:
         MissingPackageError: dask is not installed.
-        WorkersError: a worker died, or the scheduler does not answer.
+        UsageError: no scheduler answers.
+        WorkersError: a worker died.
     """
     jobs = min(jobs, len(tasks))
     if jobs == 0 or (jobs == 1 and scheduler is None):
@@ -201,14 +203,25 @@ def _dask_workers(scheduler: str) -> Iterator[Submit]:
         distributed: Any = importlib.import_module("distributed")
     # Otherwise it logs a traceback for every lost connection; errors that matter are raised.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+
+    async def greet() -> None:
+        """Connect once; a client (2026.8) waits forever for a server that sends no greeting."""
+        secured = distributed.Security().get_connection_args("client")
+        comm = await asyncio.wait_for(distributed.core.connect(scheduler, **secured), limit)
+        await comm.close()
+
+    limit = CONNECT_SECONDS
     with contextlib.ExitStack() as stack:
         try:
-            distributed.comm.resolve_address(scheduler)  # without it: a traceback after 30 s
-            client = distributed.Client(scheduler, timeout=CONNECT_SECONDS, set_as_default=False)
+            distributed.utils.LoopRunner().run_sync(greet)
+            client = distributed.Client(scheduler, timeout=limit, set_as_default=False)
             stack.enter_context(contextlib.closing(client))
-            client.wait_for_workers(1, timeout=CONNECT_SECONDS)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise WorkersError(f"no dask cluster at {scheduler}: {one_line(error)}") from error
+            client.wait_for_workers(1, timeout=WORKER_SECONDS)
+        except (OSError, ValueError, MemoryError) as error:
+            reason = one_line(error) if str(error) else f"no answer within {limit} s"
+            if isinstance(error, MemoryError):  # it takes other bytes for the length of a greeting
+                reason = "another program answers there"
+            raise UsageError(f"--scheduler: no dask cluster at {scheduler}: {reason}") from error
         try:
             yield client.get_executor(pure=False).submit
         except (distributed.KilledWorker, CancelledError) as error:

@@ -117,7 +117,7 @@ def apply_to_logs(
     Raises:
         UsageError: the run or a log does not exist, or the folder has other contents.
         LogWriteError: an output cannot be written; those before are kept.
-        WorkersError: a worker died, or no scheduler answers.
+        WorkersError: a worker died.
     """
     application, out = Application(run), Path(out).resolve()
     inputs = inputs or InputOptions()

@@ -158,7 +158,7 @@ def run_trials(
         UsageError: another process uses the folder.
         LogDamagedError: a line of the rows is damaged.
         LogWriteError: a row cannot be written.
-        WorkersError: a worker died, or no scheduler answers.
+        WorkersError: a worker died.
     """
     path = folder / ROWS
     refuse_named_as_file(folder)

@@ -60,7 +60,7 @@ def sweep(
 
     Raises:
         UsageError: a key, a value or the source is wrong; no trial has started then.
-        WorkersError: a worker died, or no scheduler answers.
+        WorkersError: a worker died.
     """
     folder, grid = Path(folder).resolve(), grid or {}
     words = (source,) if isinstance(source, str | Path) else tuple(source)

@@ -24,6 +24,7 @@ from cdmisfa.modules import Module
 from recorder.mcap.reader import LogReader
 from replay.runs.codec import define_message, parsed
 from replay.runs.folders import run_log
+from replay.runs.modules import checked
 from replay.storage.arrays import contents, stored_arrays
 
 KEYFRAME_TOPIC = "/keyframe"
@@ -164,4 +165,4 @@ def _modules(columns: Mapping[str, NDArray[Any] | list[NDArray[Any]]]) -> tuple[
         for name, column in columns.items()
     }
     rows = zip(*values.values(), strict=True)
-    return tuple(Module(**dict(zip(values, row, strict=True))) for row in rows)
+    return tuple(checked(Module(**dict(zip(values, row, strict=True)))) for row in rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.expansion import EXPANSIONS, expanded_size
 from cdmisfa.modules import Module
 from recorder.images.framing import Recipe
 from recorder.log.files import atomic_write
@@ -79,12 +81,34 @@ def _modules(stored: Mapping[str, NDArray[Any]]) -> Iterator[Module]:
             raise ValueError(f"module {index} has number {values['index']}")
         values["frame_shape"] = tuple(map(int, values["frame_shape"].tolist()))
         values["recipe"] = Recipe.from_json(values["recipe"]) if values["recipe"] else None
-        outputs, size = values["phi"].shape
-        lengths = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
-        for name, length in lengths.items():
-            if values[name].shape != (length,):
-                raise ValueError(f"{name} has shape {values[name].shape}")
-        yield Module(**values)
+        yield checked(Module(**values))
+
+
+def checked(module: Module) -> Module:
+    """Return a module from a file after checking its values.
+
+    Raises:
+        ValueError: a value is not finite, out of range, or of a shape or type that does not fit.
+    """
+    J, size = np.shape(module.phi)
+    streams, shape = np.shape(module.policy), module.frame_shape
+    fitting: dict[str, tuple[Any, ...]] = dict.fromkeys(("eta", "band_mean", "band_sd"), ((J,),))
+    fitting |= {"phi": ((J, size),), "mean": ((size,),), "slow": ((0,), (J,)), "scale": ((),)}
+    fitting |= {"policy": (streams[:1],), "counts": (np.shape(module.centres)[:2],)}
+    for name, shapes in fitting.items():
+        array = np.asarray(getattr(module, name))
+        if array.shape not in shapes or array.dtype.kind not in "fi":
+            raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
+        if name in ("phi", "mean", "scale") and not np.isfinite(array).all():
+            raise ValueError(f"{name} is not finite")
+    if not (J and size and streams and min(module.stream_index, module.iteration) >= 0):
+        raise ValueError(f"module {module.index} has no outputs, or a negative number")
+    known = bool(shape) and module.expansion in EXPANSIONS  # others can be used once registered
+    if min(shape, default=1) < 1 or (
+        known and expanded_size(module.expansion, prod(shape)) != size
+    ):
+        raise ValueError(f"{size} weights do not fit frames of shape {shape}")
+    return module
 
 
 def _key(index: int, name: str) -> str:
