@@ -141,6 +141,21 @@ def test_the_papers_learners_refuse_streams_of_several_kinds() -> None:
             learn(arrays(200), algorithm=algorithm, view=False)
 
 
+def test_modules_of_both_are_applied_to_logs_of_one_and_to_datasets(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log, dataset = log_of_both(tmp_path / "log.mcap", 400), tmp_path / "data"
+    chosen = log, "--topic", "/camera", "--topic", "/joints", "--align", "time"
+    assert cdmisfa("convert", *chosen, "-o", tmp_path / "rec").code == 0
+    assert cdmisfa("export", tmp_path / "rec", "--to", "lerobot", "-o", dataset).code == 0
+    topics = "--topic", "observation.images.camera", "--topic", "observation.joints"
+    learned = cdmisfa("learn", dataset, *topics, "-o", tmp_path / "run", "--no-rerun", "--json")
+    assert {module["stream"] for module in learned.json["modules"]} >= {"observation.joints"}
+    assert cdmisfa("apply", tmp_path / "run", dataset).code == 0
+    np.savez(tmp_path / "numbers.npz", joints=joints(400))
+    assert cdmisfa("apply", tmp_path / "run", tmp_path / "numbers.npz").code == 0
+
+
 def test_an_environment_observes_only_the_outputs_of_such_a_source() -> None:
     with pytest.raises(UsageError, match="the streams differ in shape: set observe="):
         WatchEnv(Recording(arrays(200)).source())

@@ -32,7 +32,7 @@ CEILINGS = {
     "replay/corpus": 755,
     "replay/export": 762,
     "replay/integrity": 1010,
-    "replay/logs": 2744,
+    "replay/logs": 2745,
     "replay/report": 960,
     "replay/runs": 1410,
     "replay/storage": 290,

@@ -88,8 +88,7 @@ class Application:
         recipes = [module.recipe or Recipe(module.frame_shape) for module in self.modules]
         self.recipe, self._recipes = recipes[0], recipes
         self._shapes = list(dict.fromkeys(recipe.shape for recipe in recipes))
-        topics = run.header.manifest["source"].get("topics", ())
-        self._topics = tuple(topics) if run.header.spec.kinds else ()
+        self._topics = tuple(run.header.manifest["source"].get("topics", ()))
         self._folder = run.log.parent
 
     @functools.cached_property
@@ -144,7 +143,6 @@ class Application:
 
     def _with_recipe(self, inputs: InputOptions) -> InputOptions:
         framing: Any = {"range": inputs.range or self.recipe.range}
-        framing["topics"] = inputs.topics or self._topics
         for recipe in self._recipes:
             if recipe.size is None:
                 framing["fields"] = inputs.fields or recipe.fields
@@ -160,9 +158,14 @@ class Application:
                 if recorded.spec.frame_shape in self._shapes or not recorded.spec.images:
                     return recorded
                 recorded.close()
-        return with_every_topic(
-            lambda inputs: open_logs(words, inputs=inputs, **options), self._with_recipe(inputs)
-        )
+        attempts = [how := self._with_recipe(inputs)]
+        if how.size and how.fields:  # the log may have the same topics, images only, or numbers
+            named = replace(how, topics=inputs.topics or self._topics)
+            attempts = [named, how, replace(how, size=None, fit="crop", color=False)]
+        for how in attempts[:-1]:
+            with contextlib.suppress(UsageError):
+                return with_every_topic(lambda i: open_logs(words, inputs=i, **options), how)
+        return with_every_topic(lambda i: open_logs(words, inputs=i, **options), attempts[-1])
 
     def to(
         self,
@@ -242,14 +245,7 @@ def _read_application(path: str, identity: str) -> Application:
 def _reads(
     source: FrameSource, step: int, tau: int, frames: int | None
 ) -> Iterator[Sequence[Block]]:
-    """Read a source piece by piece; each piece ends at the end of a block of the clock.
-
-    Args:
-        source: the source, read from its current frame.
-        step: number of frames to read at once, a multiple of tau.
-        tau: number of frames in a block.
-        frames: largest number of frames; None: all.
-    """
+    """Read at most some frames; each piece of `step` frames ends with a block of `tau` frames."""
     counts = [n for n in (frames, source.spec.length) if n is not None]
     end = source.t + min(counts, default=math.inf)
     while source.t < end:

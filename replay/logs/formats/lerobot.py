@@ -80,11 +80,10 @@ def streams(
     numeric, cameras = features(path)
     name, topics, fields = path.resolve().name, options.topics, options.fields
     chosen = [c for c in cameras if (fits_topic(c, topics) if topics else not fields)]
-    numbers: dict[str, tuple[str, ...]]
-    numbers = {topic: (topic,) for topic in numeric if topic in topics and not fields}
+    numbers: dict[str, tuple[str, ...]] = {n: (n,) for n in numeric if n in topics}
     if not (cameras or topics or fields):
         fields = tuple(topic for topic in numeric if topic not in _CLOCK)
-    if fields:
+    if fields and not numbers:
         if not chosen:
             check_topics(path, name, topics)
         numbers = {name: fields}
