@@ -155,8 +155,6 @@ ROWS: dict[str, tuple[Write, str, str]] = {
     "mcap depth": (raws(WORDS, "16UC1"), "", "distances (16UC1) are read as gray"),
     "mcap floats": (raws(FLOATS, "32FC1"), "", "its images are distances"),
     "mcap no distance": (raws(FLOATS * np.nan, "32FC1"), RANGE, "without a distance become black"),
-    "mcap png 16 bit": (packed(files(WORDS)), "", HIGH),
-    "mcap png alpha": (packed(files(ramp(4))), "", ALPHA),
     "mcap exif": (packed(files(ramp(), "JPEG", exif=TURNED)), "", EXIF),
     "mcap topics": (mixed, "", LEFT_OUT + "/joints"),
     "mcap one topic": (mixed, "--topic /cam", ""),
@@ -166,7 +164,6 @@ ROWS: dict[str, tuple[Write, str, str]] = {
     "mcap null in a range": (joints(None, 1.5), f"--field x {RANGE}", "not finite become 1"),
     "bag topics": (bag(ramp(), "mono8"), "", LEFT_OUT + "/chatter"),
     "bag 16 bit": (bag(WORDS, "mono16"), "", HIGH),
-    "bag alpha": (bag(ramp(4), "bgra8"), "", ALPHA),
     "lerobot features": (dataset, "", LEFT_OUT + "observation.joints"),
     "images colors": (images(files(ramp(3))), "", GRAY),
     "images alpha": (images(files(ramp(4))), "", ALPHA),
@@ -178,9 +175,7 @@ ROWS: dict[str, tuple[Write, str, str]] = {
     "npy 16 bit": (array(WORDS), "", HIGH),
     "npy floats": (array(FLOATS), "", "floats of 0 to 1 are reduced to 8 bits"),
     "npy alpha": (array(ramp(4)), "", ALPHA),
-    "npy colors": (array(ramp(3)), "", GRAY),
     "npy null": (array(np.full((COUNT, 2), np.nan)), "", "rows have NaN or infinity"),
-    "npy null images": (array(FLOATS * np.nan), "", "rows have NaN or infinity"),
     "table int64": (table(a=BIG), "", ROUNDED),
     "table words": (table(a=range(COUNT), w=["x"] * COUNT), "", "are left out: w (string)"),
     "table null": (table(a=[1.5, None] * 15), "", "has no finite number"),
@@ -194,11 +189,9 @@ ROWS: dict[str, tuple[Write, str, str]] = {
 @pytest.mark.parametrize("row", ROWS)
 def test_a_reader_states_what_it_drops(row: str, tmp_path: Path, cdmisfa: Any) -> None:
     write, options, expected = ROWS[row]
-    words = [write(tmp_path), "--rate", "50", *options.split(), "--json"]
-    done = cdmisfa("convert", *words, "-o", tmp_path / "rec")
-    if done.code:
-        assert (done.code, expected in done.err) == (2, True), done.err
-        return
-    lines = [*done.json["warnings"], *done.json["notes"]]
+    words = ["--rate", "50", *options.split(), "--json", "-o", tmp_path / "rec"]
+    done = cdmisfa("convert", write(tmp_path), *words)
+    assert done.code in (0, 2)
+    lines = [*done.json["warnings"], *done.json["notes"]] if done.code == 0 else [done.err]
     assert any(expected in line for line in lines) if expected else not lines
     assert all(line in done.err for line in lines)

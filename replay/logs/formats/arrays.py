@@ -148,11 +148,9 @@ def _frames(array: NDArray[Any], color: bool, rows: Rows) -> tuple[NDArray[Any],
     if part.ndim == 2:
         return part.astype(np.float64), no_truth
     lost("floats of 0 to 1 are reduced to 8 bits", part.dtype.kind == "f")
-    lost(HIGH_BYTE, part.dtype == np.uint16)
-    if part.dtype == np.uint16:
-        pixels = (part >> 8).astype(np.uint8)
-    else:
-        pixels = pixels_of(part).astype(np.uint8)
+    is_words = part.dtype == np.uint16
+    lost(HIGH_BYTE, is_words)
+    pixels = (part >> 8 if is_words else pixels_of(part)).astype(np.uint8)
     if pixels.ndim == 3 or color:
         return pixels, no_truth
     height, width = pixels.shape[1:3]
