@@ -47,7 +47,7 @@ FORMATS = (
 COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "index")
 REFUSED = {
     ("export", "run"): "is a run, not a recording",
-    ("export", "table"): "has no images",
+    ("export", "table"): "has streams of numbers: use --to parquet",
     ("learn", "run"): "is a run, not a recording",
     ("convert", "run"): "is a run, not a recording",
     **{("record", kind): "cdmisfa convert" for kind in FORMATS},

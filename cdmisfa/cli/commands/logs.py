@@ -257,7 +257,7 @@ def export_command(
     as_json: bool,
     **arguments: Any,
 ) -> None:
-    """Export signals or numbers as a table, or images as PNG, MP4 or LeRobot.
+    """Export signals or numbers as tables, or images and videos.
 
     The signals of a run (the values that the learner computed) go to one Parquet, CSV or NumPy
     file; CSV leaves out the outputs of single frames (y, y_frozen). The numbers of logs (--field)
@@ -282,8 +282,7 @@ def export_command(
 
     Examples:
         cdmisfa export runs/kitchen -o signals.parquet
-        cdmisfa export robot.mcap --topic /joint_states --field position -o joints.parquet
-        cdmisfa export recordings/kitchen --to mp4 -o films
+        cdmisfa export robot.mcap --field position -o joints.parquet
         cdmisfa export monday.mcap tuesday.mcap --to lerobot --lossless -o dataset
     """
     from replay.export.formats import export
