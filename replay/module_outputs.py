@@ -170,17 +170,23 @@ class ModuleOutputs:
         return None if weights is None else weights * self.deviation * self.module.scale
 
     def sheet(self) -> dict[str, list[SampledFrame]]:
-        """Return frames of least, middle and greatest first output, none of them twice."""
+        """Return frames of least, middle and greatest first output, none of them twice.
+
+        The least are below the median, the greatest above it: a periodic stream has few blocks.
+        """
         if not self.count:
             return {}
         used = {pick.t for pick in (*self._low, *self._high)}
         t, frames, y = self._thinned.columns
-        nearest = np.argsort(np.abs(y - np.median(y)), kind="stable")
+        median = float(np.median(y))
+        nearest = np.argsort(np.abs(y - median), kind="stable")
         middle = [i for i in nearest.tolist() if int(t[i]) not in used][:SAMPLE_FRAMES]
         middle.sort(key=lambda i: (float(y[i]), int(t[i])))
-        least = {pick.t for pick in self._low}
+        lows = [pick for pick in self._low if pick.y <= median]
+        least = {pick.t for pick in lows}
+        highs = [pick for pick in reversed(self._high) if pick.y >= median and pick.t not in least]
         return {
-            "least": self._low,
+            "least": lows,
             "middle": [SampledFrame(int(t[i]), frames[i], float(y[i])) for i in middle],
-            "greatest": [pick for pick in reversed(self._high) if pick.t not in least],
+            "greatest": highs,
         }

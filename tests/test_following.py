@@ -91,6 +91,16 @@ def test_outputs_are_those_on_every_logged_frame_of_the_stream(tmp_path: Path, s
         np.testing.assert_array_equal(pick.frame, every[pick.t])
 
 
+def test_of_a_periodic_stream_the_least_and_the_greatest_are_apart() -> None:
+    module = module_of(1, 30, np.ones((1, int(np.prod(VECTOR.frame_shape)))), stream=1)
+    y, blocks = np.tile(np.r_[0.0:40.0, -40.0:0.0, -40.0:0.0], 5), np.repeat(np.arange(15), 40)
+    for sign, expected in ((1, [[-40.0], [-1.0, 39.0]]), (-1, [[-39.0, 1.0], [40.0]])):
+        own = ModuleOutputs(module, VECTOR)
+        own._add(blocks, np.arange(600), np.zeros((600, module.mean.size)), sign * y)
+        sheet = own.sheet()
+        assert [[pick.y for pick in sheet[name]] for name in ("least", "greatest")] == expected
+
+
 @given(st.lists(st.integers(0, 400)), st.integers(2, 90))
 def test_rows_kept_do_not_depend_on_how_they_came(sizes: list[int], most: int) -> None:
     parts, one = Subsample(most), Subsample(most)

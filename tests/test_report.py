@@ -95,6 +95,10 @@ def test_the_page_shows_the_data_of_the_run(run: Path) -> None:
         assert least is not None
         y = module.transform(frames)[:, 0]
         assert float(least[1]) == pytest.approx(y.min(), abs=0.006)
+        of_stream = signals["iteration"][signals["stream"] == module.stream_index]
+        counts = len(of_stream) * TAU, int((of_stream > module.iteration).sum()) * TAU
+        cells = [f'<td class="number">{count:,}</td>' for count in counts]
+        assert "".join(cells) in (run / "report.html").read_text()
         assert "theta" in text  # the one true quantity of the scene
 
 

@@ -51,13 +51,14 @@ class ModuleData:
     Attributes:
         frozen: the module.
         stream: sums and extremes over all frames.
+        after: number of logged frames of the stream after its save.
         outputs: (n,) frames, (n, J) outputs and (n, D) truth, thinned; NaN where it is unknown.
         frames: (n,) frames, (n, ...) values and (n,) first outputs, thinned further.
         recent: (n,) frames and (n, J) outputs at the end.
     """
 
     def __init__(self, frozen: Module, spec: SourceSpec, frames: int) -> None:
-        self.frozen, self._spec = frozen, spec
+        self.frozen, self._spec, self.after = frozen, spec, 0
         self.stream = ModuleOutputs(frozen, spec)
         self.outputs, self.frames = Subsample(MOST_OUTPUTS), Subsample(frames)
         outputs = np.empty((0, len(frozen.eta)))
@@ -66,6 +67,8 @@ class ModuleData:
     def add(self, batch: Batch) -> None:
         """Add the outputs on the next batch of the log."""
         for t, frames, y in self.stream.take(batch):
+            blocks = batch.blocks
+            self.after += int((blocks.iterations[blocks.places(t)] > self.frozen.iteration).sum())
             truth = np.full((len(t), len(self._spec.truth)), np.nan)
             for at, values in batch.truth if self._spec.truth else ():
                 row = np.minimum(np.searchsorted(at, t), len(at) - 1)

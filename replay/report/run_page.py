@@ -162,7 +162,8 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
         "fits": truth_fits,
         "overfitting": _overfitting(run, frozen.iteration),
         "alike": max(others, default=(0.0, 0)),
-        "after": 0,
+        "after": module.after,
+        "compared": len(module.frames.columns[0]) if module.frames.columns else 0,
         "plot": None,
         "quantity": run.spec.truth[truth_fits[0].column] if truth_fits else "",
         "truth": figures.truth_plot(module, truth_fits[0]) if truth_fits else None,
@@ -173,8 +174,6 @@ def _module(run: RunData, module: ModuleData, frames: dict[str, dict[str, Any]])
     }
     if not module.outputs.columns:
         return section
-    t, _, _ = module.outputs.columns
-    section["after"] = min(int((t >= saved).sum()) * module.outputs.step, module.stream.count)
     key = f"module{frozen.index}"
     section["plot"] = plot = figures.output_plot(run, module, saved, key)
     if frozen.index <= SECTIONS:
