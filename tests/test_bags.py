@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from folders import external
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from cdmisfa.core.errors import LogDamagedError, MissingPackageError
+from cdmisfa.core.errors import LogDamagedError
 from replay.logs.open_logs import open_stream
 
 COUNT = 60
@@ -100,15 +99,6 @@ def test_a_message_that_is_no_bytes_is_damage(tmp_path: Path, value: object) -> 
         pytest.raises(LogDamagedError, match=re.escape(f"{path}: /cam_left at ") + ".*as bytes"),
     ):
         images.image(0)
-
-
-def test_without_rosbags_the_package_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = ros1_bag(tmp_path)
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
-    with pytest.raises(MissingPackageError, match=r"rosbags \(pip install rosbags\)"):
-        external(path, TOPICS)
 
 
 @pytest.mark.parametrize("make", [ros1_bag, ros2_database, ros2_bag])

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from applied_data import make_run
 from camera_files import (
     HEIGHT,
     PACKED,
@@ -205,50 +203,6 @@ def test_a_command_takes_a_log_or_says_why_not(
             assert kind in ("run", "table") or len(known) >= streams
         case "convert":
             assert [view["frames"] for view in done.json["views"]] == [COUNT] * streams
-
-
-PACKAGES = {"video": "av", "video mcap": "av", "lerobot": "av"} | dict.fromkeys(BAGS[1:], "rosbags")
-
-
-@pytest.mark.parametrize("kind", PACKAGES)
-def test_a_log_whose_package_is_missing_is_not_read_and_not_damaged(
-    kind: str,
-    logs: dict[str, list[object]],
-    cdmisfa: Cdmisfa,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    run, log, whole = make_run(cdmisfa, tmp_path), logs[kind], logs["foxglove mcap"]
-    (tmp_path / "logs").mkdir()
-    for place in (*log, *whole):
-        name = Path(str(place)).name.replace(" mcap", ".mcap")
-        (tmp_path / "logs" / name).symlink_to(str(place))
-    for name in ("av", "rosbags", "rosbags.rosbag1", "rosbags.rosbag2", "rosbags.typesys"):
-        monkeypatch.setitem(sys.modules, name, None)
-    names = ("info", "verify", "view", "export", "learn", "convert", "index")
-    lines = {name: command_line(name, kind, log, tmp_path) for name in names}
-    summarized = kind in ("lerobot", "video mcap")  # whose summary states what is in it
-    lines |= {
-        "apply": ["apply", run, *log, "-o", tmp_path / "features.parquet"],
-        "apply all": ["apply", run, *log, *whole, "-o", tmp_path / "features"],
-        "verify all": ["verify", tmp_path / "logs"],
-        "info all": ["info", tmp_path / "logs"],
-        "index all": command_line("index", kind, [tmp_path / "logs"], tmp_path),
-        "episodes": ["learn", "--episodes", *whole, *log, "--json"],
-        "damaged": ["learn", "--skip-damaged", *log, "--json"],
-    }
-    for name, line in lines.items():
-        done = cdmisfa(*line)
-        text = done.out + done.err
-        assert "damaged" not in text, (name, text)
-        if name.startswith("index"):
-            assert (done.code, done.json["unread"], done.json["broken"]) == (0, 1, 0)
-        if name.startswith("info") and summarized:
-            assert done.code == 0
-        else:
-            package = PACKAGES[kind]
-            assert f"not read: needs the package {package} (pip install {package})" in text, name
-            assert done.code == (0 if name.startswith("index") else 2), (name, text)
 
 
 @pytest.mark.parametrize("kind", [k for k in FORMATS if k not in ("recording", "run", "glob")])

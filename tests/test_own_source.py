@@ -59,7 +59,7 @@ def test_an_own_source_has_gaps_where_an_array_is_missing(tmp_path: Path) -> Non
     [
         ([], "the first step has no frame: yield an array"),
         ([{"a": None}], "the first step has no frame"),
-        ([np.zeros(3), np.zeros(4)], r"frame 1 of stream is float64 \(4,\): give numbers \(3,\)"),
+        ([np.zeros(3), np.zeros(4)], r"frame 1 of stream is float64 \(4,\): .*give \(n, 3\)"),
         ([{"a": 1.0}, {"b": 1.0}], "frame 1 is of a stream b, which the first step does not name"),
         ([np.zeros(3), np.ones(3, complex)], "frame 1 of stream is complex128"),
         ([np.array(["x"])], "frame 0 of stream is <U1"),

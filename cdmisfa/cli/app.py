@@ -184,6 +184,8 @@ def _explain(error: Exception) -> int:
         case OSError():
             where = f"{error.filename}: " if error.filename else ""
             return _fail(f"{where}{error.strerror or error}", 1)
+        case ImportError():  # of a damaged installation
+            return _fail(f"needs the package {error.name} (pip install {error.name})", 2)
         case MemoryError():
             return _fail("out of memory", 1)
     frame = traceback.extract_tb(error.__traceback__)[-1]

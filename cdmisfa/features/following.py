@@ -84,16 +84,13 @@ class SlownessSums:
     def add(self, y: FloatArray, gap: bool) -> None:
         """Add the outputs (n, J) on the next frames; `gap`: frames are missing before them."""
         if self._last is None:
-            self._origin = y[
-                0
-            ]  # so that a constant has no variance and a large mean costs no digit
+            # So that a constant has no variance, and a large mean costs no digit.
+            self._origin = y[0]
         before = y[:0] if gap or self._last is None else self._last[None]
         change, apart = np.diff(np.concatenate([before, y]), axis=0), y - self._origin
-        self._count, self._steps, self._last = (
-            self._count + len(y),
-            self._steps + len(change),
-            y[-1],
-        )
+        self._count += len(y)
+        self._steps += len(change)
+        self._last = y[-1]
         self._total += apart.sum(axis=0)
         self._squares += (apart * apart).sum(axis=0)
         self._moved += (change * change).sum(axis=0)

@@ -134,19 +134,16 @@ def _framed(
             frame = step.get(name)
             if frame is not None:
                 array = np.atleast_1d(as_array(frame, f"frame {t} of {name}"))
-                about = f"frame {t} of {name} is {array.dtype} {array.shape}"
-                numbers = array.dtype.kind in "biuf" and array.shape == recipe.shape
-                if recipe.size is None and not numbers:
-                    raise UsageError(f"{about}: give numbers {recipe.shape}, as the first")
-                if recipe.size is None and not np.isfinite(array).all():
+                try:
+                    frame = make_frame(array, recipe)
+                except UsageError as error:
+                    about = f"{array.dtype} {array.shape}"
+                    raise UsageError(f"frame {t} of {name} is {about}: {error}") from None
+                if recipe.size is None and not np.isfinite(frame).all():
                     raise UsageError(
                         f"frame {t} of {name} has NaN or infinity: fill it in, or give None for a "
                         "missing frame"
                     )
-                try:
-                    frame = make_frame(array, recipe)
-                except UsageError as error:
-                    raise UsageError(f"{about}: {error}") from None
             row.append(frame)
         yield row, np.empty(0)
 

@@ -42,7 +42,7 @@ class VideoCamera:
         color: True to decode colors.
 
     Raises:
-        UsageError: PyAV is missing, or the device does not exist.
+        UsageError: the device does not exist.
     """
 
     recipe = VIDEO_RECIPE
@@ -50,7 +50,7 @@ class VideoCamera:
     def __init__(self, word: str, name: str, *, color: bool = False) -> None:
         self.name = name
         self.rate: float | None = None
-        self._av = pyav(word)
+        self._av = pyav()
         self._public_word = _SECRET.sub("", word)
         self._form: str | None = None
         self._address = word

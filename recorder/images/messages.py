@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import CdmisfaError, needs, one_line
+from cdmisfa.core.errors import one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.compressed import compressed_image, compressed_words
 from recorder.images.fields import EVERY, Field, field_value, members, number_paths, numbers_of
@@ -310,7 +310,7 @@ def message_decoder(kind: MessageKind) -> MessageDecoder | None:
 def _opened(schema: str, decode: MessageDecoder, data: bytes) -> Any:
     try:
         return decode(data)
-    except CdmisfaError:
+    except ImportError:
         raise
     except Exception as error:  # protobuf and rosbags raise various exceptions for damaged data
         raise MalformedImage(f"a message is not a {schema} ({one_line(error)})") from None
@@ -337,8 +337,8 @@ def _ros(kind: MessageKind) -> MessageDecoder:
 
     @cache
     def deserializer() -> Any:
-        with needs("not read", "rosbags"):
-            from rosbags import typesys as ros
+        from rosbags import typesys as ros
+
         ros1 = kind.encoding == "ros1"
         text = kind.definition.decode("utf-8", "replace")
         if not text.strip():  # without a definition, use ROS's own

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from cdmisfa.core.arrays import ByteArray
-from cdmisfa.core.errors import UsageError, needs
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import BUDGET
 from recorder.images.pixels import GRAY, MAX_PIXELS, MalformedImage, lost, raw_image
 
@@ -168,12 +168,12 @@ class VideoPackets:
 
         Raises:
             MalformedImage: the image is damaged, or an earlier one that it needs is missing.
-            UsageError: PyAV is missing, or images depend on later ones.
+            UsageError: images depend on later ones.
         """
         data, codec = self._packet_of(message)
         if not data:
             raise MalformedImage("its message is empty, without an image of its video")
-        av = pyav("not read")
+        av = pyav()
         name = _codec(codec)
         if name != self._codec:
             self._codec, self._context = name, av.CodecContext.create(name, "r")
@@ -209,14 +209,10 @@ def most_pixels(form: Any, codec: Any) -> int:
     return min(MAX_PIXELS, BUDGET * 8 // (images * bits))
 
 
-def pyav(user: str) -> Any:
-    """Import PyAV, which is slow, for `user`, the beginning of the error.
+def pyav() -> Any:
+    """Import PyAV, which is slow."""
+    import av
 
-    Raises:
-        MissingPackageError: PyAV is not installed.
-    """
-    with needs(user, "av"):
-        import av
     av.logging.set_level(None)
     return av
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, MissingPackageError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.names import counted, kind_of_frames
 from recorder.images.options import InputOptions
 from replay.corpus.episode import (
@@ -78,7 +78,7 @@ class EpisodeSource(StoredSource):
             progress: called with the number of opened logs and the total.
 
         Raises:
-            UsageError: no log has frames, or a package that reads one is missing.
+            UsageError: no log has frames.
             LogDamagedError: no log can be read.
         """
         if inputs is not None and inputs.color == "auto":
@@ -104,8 +104,6 @@ class EpisodeSource(StoredSource):
                 with contextlib.closing(self._open(log)) as source:
                     episodes.append(episode_of(log, name, source, self._open))
                     warnings.extend(source.warnings)
-            except MissingPackageError:
-                raise
             except CdmisfaError as error:
                 errors.append(error)
             progress(done, len(logs))

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, MissingPackageError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import view_topic
 from recorder.mcap.reader import LogReader
@@ -22,7 +22,7 @@ from replay.integrity.report import failed
 from replay.logs.clock import missing
 from replay.logs.formats.lerobot import LAYOUT as DATASET
 from replay.logs.open_logs import identity_of, image_topics, is_external_format, open_stream
-from replay.logs.stream import ChannelInfo, LogStream
+from replay.logs.stream import ChannelInfo
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
@@ -87,6 +87,8 @@ def read_rows(logs: Sequence[ListedLog], deep: bool) -> tuple[pa.Table, list[str
         try:
             if not problem:
                 streams = list(_streams_of(location(log.file), log, deep))
+        except ImportError:
+            raise
         except Exception as error:  # libraries raise anything for a broken file
             if not (is_url(log.file) or os.path.lexists(log.file)):
                 gone.append(log.path)
@@ -172,22 +174,17 @@ def _decoded(place: Path, topic: str) -> dict[str, Any]:
             shape = "x".join(map(str, stream.image(0).shape))
             gaps = 0 if stream.times is None else int(missing(stream.times).sum())
             if stream.program == DATASET:  # it pauses between episodes, where nothing is missing
-                gaps = sum(not _has(stream, row) for row in range(stream.count))
+                gaps = 0
+                for row in range(stream.count):
+                    try:
+                        stream.fetch(row)
+                    except MalformedRecord:
+                        gaps += 1
             return {"shape": shape, "gaps": gaps}
-    except MissingPackageError:
-        raise
     except LogDamagedError as error:
         return {"problem": str(error).removeprefix(f"{place}: ")}
     except (MalformedRecord, UsageError):  # the topic has no image
         return {}
-
-
-def _has(stream: LogStream, row: int) -> bool:
-    try:
-        stream.fetch(row)
-    except MalformedRecord:
-        return False
-    return True
 
 
 def _hash_of(identity: Identity) -> str:

@@ -117,14 +117,12 @@ def _opened(
     first = None
     for log in [[path] for path in paths] if separate else [paths]:
         with contextlib.closing(open_for_viewing(log, inputs)) as source:
-            spec, why = source.spec, ""
+            spec, why, count = source.spec, "", len(source.spec.streams)
             first = first or spec
             if form not in ("lerobot", *NUMBERS) and not spec.images:
                 why = "has streams of numbers: use --to parquet or --to lerobot"
-            elif single and len(spec.streams) > 1:
-                why = (
-                    f"has {len(spec.streams)} streams: choose a folder instead of one .{form} file"
-                )
+            elif single and count > 1:
+                why = f"has {count} streams: choose a folder instead of one .{form} file"
             for name in ("streams", "frame_shape", "dtype", "truth", "fps"):
                 if (a := getattr(first, name)) != (b := getattr(spec, name)):
                     why = f"has {name} {b}, but {paths[0]} has {a}: export them separately"

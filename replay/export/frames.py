@@ -122,7 +122,7 @@ def write_video(
         UsageError: PyAV is not installed.
         CdmisfaError: the file cannot be written.
     """
-    av, spec, count = pyav("writing videos"), source.spec, 0
+    av, spec, count = pyav(), source.spec, 0
     shape, _ = spec.kind(stream)
     first = source.first_frame if spans is None else spans[0][0]
     comment = {

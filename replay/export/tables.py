@@ -117,11 +117,8 @@ def write_streams(source: LoggedSource, place: Path, form: str, *, single: bool)
         messages = source.messages(i, ROWS)
         _, first = piece = next(messages)
         names = log.columns() or column_names(name, first[0].size)
-        if (
-            first.ndim > 2
-            or len(names) != first.shape[1]
-            or len({"log_time", *names}) <= len(names)
-        ):
+        unequal = len(names) != first.shape[1] or len({"log_time", *names}) <= len(names)
+        if first.ndim > 2 or unequal:
             what = "images" if first.ndim > 2 else f"columns {', '.join(names)}"
             raise UsageError(f"{log.path}: {name} has {what}: choose numbers with --field")
         kinds = {"log_time": pa.int64(), **dict.fromkeys(names, pa.float64())}

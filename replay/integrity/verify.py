@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, MissingPackageError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.core.untrusted import read_regular
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
@@ -342,8 +342,6 @@ def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:
                 notes |= dict.fromkeys((*stream.remarks, *stream.warnings))
         except LogDamagedError as error:
             problems.append(as_problem(path, error))
-        except MissingPackageError as error:
-            return failed(path, error)
         except UsageError as error:  # it needs an option
             reason = str(error).removeprefix(f"{path}: ")
             notes[f"{path}: {topic} was not decoded: {reason}"] = None

@@ -102,7 +102,7 @@ class Images:
             remedy = "" if self._skip_damaged else f": {REMEDY}"
             raise LogDamagedError(f"{name(row)}: {error}{remedy}") from None
         except UsageError as error:
-            raise type(error)(f"{name(row)}: {error}") from None
+            raise UsageError(f"{name(row)}: {error}") from None
 
     def _decoded(self, stream: int, row: int) -> Content:
         image = self.pop((stream, row))

@@ -131,15 +131,11 @@ class LiveView(Sink):
             starts, tau = np.array([s.t for s in self._records]), len(self._records[-1].y)
             frames = (starts[:, None] + np.arange(tau)).reshape(-1)
             signals = tuple(columns_of_records(self._records))
+            watched = (zip(*of_kind, strict=True) for of_kind in self._watched.values())
             batch = Batch(
                 signals=signals,
                 blocks=Blocks.concatenated([*map(Blocks.of, signals)]),
-                watched=tuple(
-                    (np.concatenate(t), np.concatenate(values))
-                    for t, values in (
-                        zip(*of_kind, strict=True) for of_kind in self._watched.values()
-                    )
-                ),
+                watched=tuple((np.concatenate(t), np.concatenate(x)) for t, x in watched),
                 truth=((frames, np.concatenate(self._truth)),),
                 phi=tuple(self._phi),
                 events=(),

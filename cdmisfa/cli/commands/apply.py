@@ -184,13 +184,9 @@ def _apply_to_each(
             if totals.damaged is not None:
                 printing.status(f"{error}: the outputs before the damage are written")
                 code = totals.damaged.exit_code
-            row: dict[str, Any] = {
-                "log": " ".join(words),
-                "out": output and str(output),
-                "frames": totals.frames,
-            }
-            row |= {"error": error, "warnings": warnings_of(source), "modules": totals.rows()}
-            rows.append(row)
+            row: dict[str, Any] = {"log": " ".join(words), "out": output and str(output)}
+            row |= {"frames": totals.frames, "error": error, "warnings": warnings_of(source)}
+            rows.append({**row, "modules": totals.rows()})
             if stop():
                 break
     if as_json and not as_lines:

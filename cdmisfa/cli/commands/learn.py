@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,7 +55,6 @@ def learn_command(
     algorithm: str | None,
     max_iterations: int | None,
     max_modules: int | None,
-    passes: int | None,
     resume: bool,
     live_view: bool,
     no_rerun: bool,
@@ -99,7 +98,6 @@ def learn_command(
         cdmisfa learn camera:/dev/video0 --record recordings/desk -o runs/desk
         cdmisfa learn recordings/kitchen --loop --max-modules 2 -o runs/kitchen
     """
-    from cdmisfa.experiments.documents import about_source
     from cdmisfa.experiments.run_folder import command_of
     from cdmisfa.experiments.session import Session
     from recorder.cameras.words import is_live
@@ -112,7 +110,6 @@ def learn_command(
         settings = (*settings, f"learner.algorithm={algorithm}")
     live = any(map(is_live, source))
     arguments |= {"inputs": inputs, "settings": settings, "seed": seed, "resumed": resume}
-    arguments["passes"] = passes
     with (
         _opened_source(source, output, record_to, force, **arguments) as (frames, configuration),
         learning(frames, max_iterations) as (stop, progress),
@@ -132,8 +129,7 @@ def learn_command(
             hashing=progress.hashing,
         )
         result = _run_learner(session, stop, progress, rerun=not no_rerun, live_view=live_view)
-    about = about_source(frames) if as_json else None
-    code = _print_run(result, stop, can_resume=not live, about=about)
+    code = _print_run(result, stop, frames, can_resume=not live, as_json=as_json)
     return code or (LogDamagedError.exit_code if getattr(frames, "left_out", ()) else 0)
 
 
@@ -213,20 +209,14 @@ def _run_learner(
 
 
 def _print_run(
-    result: RunResult, stop: Stop, *, can_resume: bool, about: Mapping[str, Any] | None
+    result: RunResult, stop: Stop, source: FrameSource, *, can_resume: bool, as_json: bool
 ) -> int:
-    """Print the result of a run, write its report unless interrupted; return the exit code.
-
-    Args:
-        result: the result.
-        stop: the signals so far.
-        can_resume: whether an interrupted run can be continued.
-        about: keys about the source, for a JSON document; None for text.
-    """
+    """Print the result of a run, write its report unless interrupted; return the exit code."""
     from cdmisfa.core.outcomes import INTERRUPTED
+    from cdmisfa.experiments.documents import about_source
     from cdmisfa.experiments.reports import write_report
 
-    printing.result(result, about)
+    printing.result(result, about_source(source) if as_json else None)
     folder = printing.quoted(result.run or "")
     if result.ended == INTERRUPTED:
         if folder and can_resume:
@@ -240,14 +230,12 @@ def _print_run(
                 f"no report was written ({one_line(error)}): try again with cdmisfa report {folder}"
             )
         else:
-            if about is None:
+            if not as_json:
                 printing.line(f"report written to {page}")
     if more := result.more_passes:
         again = f"continue with cdmisfa learn --resume --passes {more} -o {folder}"
-        names = ", ".join(result.undecided)
-        printing.status(
-            f"{names} not decided: {again if folder else f'learn again with --passes {more}'}"
-        )
+        again = again if folder else f"learn again with --passes {more}"
+        printing.status(f"{', '.join(result.undecided)} not decided: {again}")
     return 0
 
 
@@ -293,7 +281,6 @@ def fork_command(
         cdmisfa fork runs/kitchen --iteration 100 --seed 7 -o runs/seed7
         cdmisfa fork runs/kitchen --iteration 0 --max-modules 2 -o runs/two
     """
-    from cdmisfa.experiments.documents import about_source
     from cdmisfa.experiments.session import Session
 
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
@@ -305,5 +292,4 @@ def fork_command(
         result = _run_learner(session, stop, progress, rerun=not no_rerun)
     both = f"{printing.quoted(run)} {printing.quoted(output)}"
     printing.status(f"compare both with cdmisfa compare {both} --save both.rrd")
-    about = about_source(session.source) if as_json else None
-    return _print_run(result, stop, can_resume=True, about=about)
+    return _print_run(result, stop, session.source, can_resume=True, as_json=as_json)

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from recorder.images.options import InputOptions
     from recorder.recording import ViewRecording
 
+# Lines about a source that makes its images itself.
+NO_LINES: Mapping[str, Any] = {"warnings": [], "notes": []}
+
 
 @options.command("record")
 @click.argument("source", nargs=-1, type=options.WORD)
@@ -257,18 +260,13 @@ def _print_recording(
     folder: Path,
     files: Sequence[ViewRecording],
     as_json: bool,
-    about: Mapping[str, Any] | None = None,
+    about: Mapping[str, Any] = NO_LINES,
 ) -> int:
     """Print the file of each view of a recording; return the exit code 0."""
     if as_json:
         frames = sum(file.frames for file in files if file.name == files[0].name)
         views = [file.as_json() for file in files]
-        printing.document(
-            recording=str(folder),
-            frames=frames,
-            views=views,
-            **(about or {"warnings": [], "notes": []}),
-        )
+        printing.document(recording=str(folder), frames=frames, views=views, **about)
     else:
         rows = [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files]
         printing.table(("view", "file", "frames", "bytes", "sha256"), rows)

@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 
 from cdmisfa.core.arrays import IntArray
-from cdmisfa.core.errors import LogDamagedError, needs
+from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import InputOptions
@@ -168,9 +168,9 @@ def _remark(path: Path) -> str:
 @contextlib.contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """Open a bag; raises as `bag_channels` does."""
-    with needs(f"{path}: not read", "rosbags"):
-        from rosbags.rosbag1 import Reader as Rosbag1
-        from rosbags.rosbag2 import Reader as Rosbag2
+    from rosbags.rosbag1 import Reader as Rosbag1
+    from rosbags.rosbag2 import Reader as Rosbag2
+
     ros1 = path.suffix == ".bag" and path.is_file()
     with _parts(path) as parts, ExitStack() as opened:
         with limited(path, "rosbags"):

@@ -102,15 +102,11 @@ def _converted(table: Any, fields: Sequence[str]) -> list[str]:
     """Return a line for durations and one for decimals among the columns that are read."""
     import pyarrow.types as kinds
 
-    lines = []
-    for is_kind, what in (
-        (kinds.is_duration, "durations are read in seconds"),
-        (kinds.is_decimal, "decimals are rounded to float64"),
-    ):
-        columns = zip(table.column_names, table.schema.types, strict=True)
-        if names := [name for name, kind in columns if name in fields and is_kind(kind)]:
-            lines.append(f"{what}: {', '.join(names)}")
-    return lines
+    read = {name: table[name].type for name in table.column_names if name in fields}
+    durations = [name for name, kind in read.items() if kinds.is_duration(kind)]
+    decimals = [name for name, kind in read.items() if kinds.is_decimal(kind)]
+    lines = [f"durations are read in seconds: {', '.join(durations)}"] if durations else []
+    return lines + [f"decimals are rounded to float64: {', '.join(decimals)}"] * bool(decimals)
 
 
 def number_stream(
@@ -264,15 +260,9 @@ def _refuse_words(path: Path, table: Any, names: Sequence[str]) -> None:
 def _is_numeric(column: Any) -> bool:
     import pyarrow.types as kinds
 
-    kind = column.type
-    tests = (
-        kinds.is_integer,
-        kinds.is_floating,
-        kinds.is_boolean,
-        kinds.is_decimal,
-        kinds.is_duration,
-    )
-    return any(is_kind(kind) for is_kind in tests) and column.null_count < len(column)
+    names = "integer", "floating", "boolean", "decimal", "duration"
+    numeric = any(getattr(kinds, f"is_{name}")(column.type) for name in names)
+    return numeric and column.null_count < len(column)
 
 
 def _floats(column: Any) -> FloatArray:
@@ -281,9 +271,8 @@ def _floats(column: Any) -> FloatArray:
 
     if not kinds.is_duration(column.type):
         return np.array(column.cast("float64", safe=False))
-    return np.array(column.cast("int64").cast("float64", safe=False)) * (
-        UNITS[column.type.unit] / 1e9
-    )
+    counts = np.array(column.cast("int64").cast("float64", safe=False))
+    return counts * (UNITS[column.type.unit] / 1e9)
 
 
 def _column(path: Path, table: Any, name: str) -> FloatArray:

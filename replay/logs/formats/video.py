@@ -84,7 +84,7 @@ class VideoFile:
     def __init__(self, path: Path, color: bool = False) -> None:
         self.path = path
         self._to_pixels = frame_colors if color else frame_gray
-        self._av = pyav(f"{path}: not read")
+        self._av = pyav()
         self._next = _NOWHERE
         self._cut = _NOWHERE  # time of the last frame of a file that was cut, which may be a part
         self._frames: Iterator[Any] = iter(())
