@@ -8,11 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import centred, mean_of
-from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, check_request, freeze
+from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, check_request, freeze, one_block
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.images.options import Centre
 from replay.storage.identity import Identity
@@ -163,25 +162,27 @@ class StoredSource(ClockedSource):
 
     def _in_passes(self, stream: int, start: int, stop: int, frames: int) -> Iterator[Span]:
         """Yield the unbroken stretches in the first `frames` frames of each pass; see `spans`."""
-        if self.passes == 1:
-            yield from self._spans(stream, start, stop)
-            return
-        for number in range((start - self.first_frame) // self.lap, self.passes):
-            begin = self.first_frame + number * self.lap
-            low, high = max(start, begin), min(stop, begin + frames)
-            if low < high:
-                yield from self._spans(stream, low, high)
-            if stop <= begin:
-                return
+        first, low, high = self.first_frame, start, start
+        laps = (stop - 1 - first) // self.lap + 1
+        for number in range((start - first) // self.lap, laps if self._loop else self.passes):
+            by = number * self.lap
+            if stop <= first + by:
+                break
+            span = max(start - by, first), min(stop - by, first + frames)
+            for begin, end in self._spans(stream, number, *span):
+                if begin + by != high:  # else a loop, which continues without a gap
+                    if low < high:
+                        yield low, high
+                    low = begin + by
+                high = end + by
+        if low < high:
+            yield low, high
 
-    def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
-        """See `spans`; both ends are in the same pass, unless the source loops."""
-        if not self.gaps:
-            return [(start, stop)]
-        first, count = self.first_frame, self.lap
-        laps = range((start - first) // count, (stop - 1 - first) // count + 1)
-        shifted = ((lap * count, span) for lap in laps for span in self._ranges[stream])
-        return merged((max(low + by, start), min(high + by, stop)) for by, (low, high) in shifted)
+    def _spans(self, stream: int, lap: int, start: int, stop: int) -> Iterable[Span]:
+        """Return the unbroken stretches in a part of a lap, by the frames of the first one."""
+        ranges = self._ranges[stream] if self.gaps else [(start, stop)]
+        clipped = ((max(low, start), min(high, stop)) for low, high in ranges)
+        return [(low, high) for low, high in clipped if low < high]
 
     def episode(self, stream: int, t: int) -> Span:
         """Return the episode [start, stop) of a frame, in the first lap.
@@ -278,26 +279,24 @@ class StoredSource(ClockedSource):
 
     @abstractmethod
     def _block(self, stream: int, t: int, n: int) -> Block:
-        """Read the frames [t, t + n) of a stream, none of a gap; t may be of a later lap."""
+        """Read the frames [t, t + n) of a stream, all of one lap and none of a gap."""
 
     @abstractmethod
     def _name(self) -> str:
         """Return the name of the source in errors."""
 
     def _centred(self, stream: int, t: int, n: int) -> Block:
-        """Read frames as `_block`; without the mean of their episode if they are centred so."""
-        block = self._block(stream, t, n)
-        if self.centre == "run":
-            return block
-        parts, at = [], 0
-        while at < n:  # an episode ends where a lap does
-            place = (t + at - self.first_frame) % self.lap
-            count = min(n - at, self.frames - place)
-            mean = self._mean(stream, t + at)
-            parts.append(centred(block.frames[at : at + count], mean))
-            at += count
-        frames = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        return replace(block, frames=freeze(frames))
+        """Read frames of any laps; without the mean of their episode if they are centred so."""
+        parts, at = list[Block](), t
+        while at < t + n:  # an episode ends where a lap does
+            left = self.frames - (at - self.first_frame) % self.lap
+            block = self._block(stream, at, min(t + n - at, left))
+            if self.centre != "run":
+                frames = centred(block.frames, self._mean(stream, at))
+                block = replace(block, frames=freeze(frames))
+            parts.append(block)
+            at += len(block)
+        return one_block(parts)
 
     def _mean(self, stream: int, t: int) -> NDArray[Any]:
         """Return the mean of the episode of a frame, for which all of it is read."""

@@ -288,7 +288,7 @@ class ForwardSource(Described, FrameSource):
                     run, count = [], 0
                 run.append(block)
                 count += len(block)
-        return join_blocks(run)
+        return one_block(run)
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
@@ -375,7 +375,7 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
         raise ValueError(f"a block has at least one frame, not {n}")
 
 
-def join_blocks(run: Sequence[Block]) -> Block:
+def one_block(run: Sequence[Block]) -> Block:
     """Return consecutive blocks of a stream as one block."""
     if len(run) == 1:
         return run[0]

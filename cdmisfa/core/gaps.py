@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block, freeze, join_blocks
+from cdmisfa.core.blocks import Block, freeze, one_block
 
 
 def stretches(
@@ -44,4 +44,4 @@ def unbroken(blocks: Iterable[Block]) -> list[Block]:
         if runs[-1] and runs[-1][-1].t + len(runs[-1][-1]) != block.t:
             runs.append([])
         runs[-1].append(block)
-    return [join_blocks(run) for runs in by_stream.values() for run in runs]
+    return [one_block(run) for runs in by_stream.values() for run in runs]

@@ -211,22 +211,13 @@ class EpisodeSource(StoredSource):
             source.close()
             self._open_now = None
 
-    def _spans(self, stream: int, start: int, stop: int) -> Iterable[Span]:
-        name = self._spec.streams[stream]
-        lap, at = divmod(start, self.lap)
-        number = max(bisect.bisect_right(self._starts, at) - 1, 0)
-        while True:
-            for i in range(number, len(self._episodes)):
-                episode = self._episodes[i]
-                if lap * self.lap + episode.start >= stop:
-                    return
-                for low, high in episode.spans(name, lap):
-                    low, high = low + lap * self.lap, high + lap * self.lap
-                    if max(low, start) < min(high, stop):
-                        yield max(low, start), min(high, stop)
-            if not self._loop:
+    def _spans(self, stream: int, lap: int, start: int, stop: int) -> Iterable[Span]:
+        for episode in self._episodes[max(bisect.bisect_right(self._starts, start) - 1, 0) :]:
+            if episode.start >= stop:
                 return
-            lap, number = lap + 1, 0
+            for low, high in episode.spans(self._spec.streams[stream], lap):
+                if max(low, start) < min(high, stop):
+                    yield max(low, start), min(high, stop)
 
     def _block(self, stream: int, t: int, n: int) -> Block:
         place = t % self.lap

@@ -158,16 +158,8 @@ class LoggedSource(StoredSource):
             self._together = False
 
     def _block(self, stream: int, t: int, n: int) -> Block:
-        rows, parts = self._clock.rows[stream], []
-        at = t
-        while at < t + n:
-            place = (at - self.first_frame) % self.lap
-            stop = min(place + t + n - at, self.frames)
-            parts.append(self._frames(stream, at, rows[place:stop]))
-            at += stop - place
-        frames, truth = parts[0]
-        if len(parts) > 1:
-            frames, truth = (np.concatenate(each) for each in zip(*parts, strict=True))
+        place = (t - self.first_frame) % self.lap
+        frames, truth = self._frames(stream, t, self._clock.rows[stream][place : place + n])
         return Block(stream, t, freeze(frames), freeze(truth))
 
     def _frames(self, stream: int, t: int, rows: Rows) -> tuple[NDArray[Any], FloatArray]:

@@ -206,7 +206,7 @@ def explained(path: object, program: str, remedy: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except CdmisfaError:
+    except (CdmisfaError, ImportError):
         raise
     except MemoryError:
         limit = f"the limit of {BUDGET >> 20} MiB of memory"
