@@ -59,9 +59,7 @@ def open_log(
     return open_external(paths, inputs, loop=loop, skip_damaged=skip_damaged)
 
 
-def open_for_viewing(
-    paths: Sequence[Path], inputs: InputOptions | None = None, *, skip_damaged: bool = False
-) -> LoggedSource:
+def open_for_viewing(paths: Sequence[Path], inputs: InputOptions | None = None) -> LoggedSource:
     """Open logs to view or export them: every topic of images, aligned by time if need be.
 
     Logs of up to `AT_ONCE` bytes are checked completely, larger ones as they are read.
@@ -75,11 +73,9 @@ def open_for_viewing(
     source = None
     if not (inputs.topics or inputs.fields or any(map(is_external_format, paths))):
         with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
-            source = open_recording(paths, skip_damaged=skip_damaged)
+            source = open_recording(paths)
     if source is None:
-        source = with_every_topic(
-            lambda how: open_external(paths, how, skip_damaged=skip_damaged), inputs
-        )
+        source = with_every_topic(lambda how: open_external(paths, how), inputs)
     try:
         source.describe_at_once()
     except BaseException:
@@ -131,11 +127,8 @@ def open_recording(
                     raise
                 broken.append(error)
         if not files:
-            raise (
-                broken[0]
-                if broken
-                else NoRecordingError(f"{named[0]}: the recording has no frames yet")
-            )
+            nothing = NoRecordingError(f"{named[0]}: the recording has no frames yet")
+            raise [*broken, nothing][0]
         streams = views.streams(files, skip_damaged=skip_damaged)
         left_out = [f"{error}: this log is skipped" for error in broken]
         return LoggedSource(streams, loop=loop, opened=failed.pop_all(), left_out=left_out)

@@ -270,9 +270,8 @@ def free_port(port: int = 0) -> int:
 
 def has_display() -> bool:
     """Return whether a window can be opened."""
-    return not sys.platform.startswith("linux") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
+    displays = map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))
+    return not sys.platform.startswith("linux") or any(displays)
 
 
 def vulkan_drivers() -> list[Path]:

@@ -344,10 +344,8 @@ class Totals:
         sums[1] += count * applied.alive
         sums[2] += count * ~np.isnan(applied.novelty)
         sums[3] += count * (applied.novelty <= 1)
-        gap = block.t != self._ends.get(stream)
-        self._slowness.setdefault(stream, SlownessSums(len(self._firsts))).add(
-            applied.y[:, self._firsts], gap
-        )
+        slowness = self._slowness.setdefault(stream, SlownessSums(len(self._firsts)))
+        slowness.add(applied.y[:, self._firsts], gap=block.t != self._ends.get(stream))
         self._ends[stream] = block.t + count
 
     def rows(self) -> list[dict[str, Any]]:

@@ -186,7 +186,7 @@ def apply_to_log(
     with contextlib.closing(application.open(files, **options)) as source:
         totals = Totals(source.spec, modules)
         with (
-            written_to(part, source.spec, modules, force=True, log=column) as sink,
+            written_to(part, source.spec, modules, column) as sink,
             contextlib.closing(application.to(source, frames)) as blocks,
         ):
             follow(blocks, [sink], totals)
@@ -199,14 +199,14 @@ def apply_to_log(
 
 
 def written_to(
-    place: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
+    place: Path, spec: SourceSpec, modules: Sequence[Module], log: str | None = None
 ) -> AbstractContextManager[AppliedSink]:
     """Open the sink that writes outputs in the format of a file name; see `written`."""
     if place.suffix.lower() == ".rrd":
         from replay.view.applied import written_view  # imports Rerun, which takes 0.5 s
 
-        return written_view(place, spec, modules, force=force)
-    return written(place, spec, modules, force=force, log=log)
+        return written_view(place, spec, modules)
+    return written(place, spec, modules, log)
 
 
 def _earlier_root(folder: Path, request: Mapping[str, Any], *, force: bool) -> str:
@@ -267,9 +267,8 @@ def _find_logs(
             name = log.name
             if "://" not in name:
                 # A single view has the name of its file: other views may follow into the folder.
-                name = os.path.normpath(
-                    path.parent / (log.files[0] if len(log.files) == 1 else name)
-                )
+                file = log.files[0] if len(log.files) == 1 else name
+                name = os.path.normpath(path.parent / file)
                 if name.startswith(os.path.join(out, "")):
                     continue
                 name = os.path.relpath(name, root) if name != root else os.path.basename(name)

@@ -122,11 +122,8 @@ def evaluate(
                 }
     except _StoppedError:
         return None
-    return {
-        "frames": list(held_out),
-        "fitted": list(fitted),
-        "modules": [rows[index] for index in sorted(rows)],
-    }
+    in_order = [rows[index] for index in sorted(rows)]
+    return {"frames": list(held_out), "fitted": list(fitted), "modules": in_order}
 
 
 def _pieces(

@@ -144,11 +144,8 @@ class Session:
         spec_then, spec_now = (spec.as_json() for spec in (header.spec, source.spec))
         then = {**header.manifest, "source": source_then, "spec": spec_then, COMMAND: None}
         now = {**as_json, "source": source_now, "spec": spec_now, COMMAND: None}
-        changed = {
-            key.removeprefix("config."): values
-            for key, *values in differences(then, now)
-            if key not in OF_PASSES
-        }
+        found = (entry for entry in differences(then, now) if entry[0] not in OF_PASSES)
+        changed = {key.removeprefix("config."): values for key, *values in found}
         if changed:
             # Another learner has other keys, so its name is the reason for all differences.
             key = "learner.algorithm" if "learner.algorithm" in changed else next(iter(changed))

@@ -175,10 +175,8 @@ def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[FloatArra
     sizes = [math.prod(shape) for shape in shapes]
     out = np.empty(sum(sizes))
     words = rng.bit_generator.random_raw(out.size + out.size // 16 + 64)
-    while (
-        lib.normals(_buffer("uint64_t[]", words), words.size, _buffer("double[]", out), out.size)
-        < 0
-    ):
+    into = _buffer("double[]", out), out.size
+    while lib.normals(_buffer("uint64_t[]", words), words.size, *into) < 0:
         words = np.concatenate([words, rng.bit_generator.random_raw(words.size)])
     ends = np.cumsum(sizes)[:-1]
     return [part.reshape(s) for part, s in zip(np.split(out, ends), shapes, strict=True)]
@@ -189,14 +187,8 @@ def outputs(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
     rows = len(phi)
     x = frames_of(frames, phi.shape[1])
     y = np.empty((x.pointer.n, rows))
-    code = lib.outputs(
-        rows,
-        readable("phi", phi, (rows, x.pointer.size)),
-        readable("offset", offset, (rows,)),
-        x.pointer,
-        _buffer("double[]", y),
-    )
-    check(code, "phi")
+    weights = readable("phi", phi, (rows, x.pointer.size)), readable("offset", offset, (rows,))
+    check(lib.outputs(rows, *weights, x.pointer, _buffer("double[]", y)), "phi")
     return y
 
 
@@ -204,13 +196,8 @@ def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
     """Return (J,) the outputs of phi (J, I) on the mean input (I,)."""
     rows, size = phi.shape
     out = np.empty(rows)
-    lib.mean_output(
-        rows,
-        size,
-        readable("phi", phi, phi.shape),
-        readable("mean", mean, (size,)),
-        _buffer("double[]", out),
-    )
+    inputs = readable("phi", phi, phi.shape), readable("mean", mean, (size,))
+    lib.mean_output(rows, size, *inputs, _buffer("double[]", out))
     return out
 
 

@@ -80,9 +80,8 @@ class Recording(Described):
         """Return a recording of a source; a `Recording` itself is returned unchanged."""
         if isinstance(source, cls):
             return source
-        return (
-            cls(*source) if isinstance(source, list | tuple) and as_words(source) else cls(source)
-        )
+        several = isinstance(source, list | tuple) and as_words(source)
+        return cls(*source) if several else cls(source)
 
     def source(self, *, loop: bool = False) -> Any:
         """Open the streams as a `SeekableSource`, for a `with` statement.

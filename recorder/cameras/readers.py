@@ -103,10 +103,8 @@ class CameraFrames:
             earlier = [self._framings.get(number) for number in range(camera)]
             if image.ndim > 1 and self._size is None and None in earlier:
                 return None
-            known = list(self._framings.values())
-            if image.ndim < 2 and (
-                len(known) + 1 < len(self._names) or any(f.first for f in known)
-            ):
+            images = any(framing.first for framing in self._framings.values())
+            if image.ndim < 2 and (images or len(self._framings) + 1 < len(self._names)):
                 framing = Framing((), image.shape)  # as another stream may have images
                 self._say(f"{name}: {framing}")
             else:

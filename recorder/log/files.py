@@ -273,10 +273,8 @@ def view_logs(folder: Path, views: Collection[str]) -> dict[str, list[Path]]:
 
 def holds_recording(folder: Path) -> bool:
     """Return whether a folder has parts of a recording, or is empty."""
-    paths = list(folder.iterdir()) if folder.is_dir() else []
-    return not paths or any(
-        _LOG.fullmatch(path.name) or path.name.startswith(RECORDING) for path in paths
-    )
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    return not names or any(_LOG.fullmatch(n) or n.startswith(RECORDING) for n in names)
 
 
 @contextlib.contextmanager

@@ -249,9 +249,8 @@ def _resume_view(
                 f"{finished[0]} exists, but frame {stop} of {view} before it is missing: recover "
                 "that part, or overwrite with --force"
             )
-        if stop > first:
-            return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
-        return ViewResume(path, tuple(parts), first, stale=(*stale, *attempts, *later))
+        copied, end = (log, stop) if stop > first else (None, 0)
+        return ViewResume(path, tuple(parts), first, copied, end, (*stale, *replaced))
 
 
 def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:

@@ -326,9 +326,8 @@ def _logs_by_path(words: Sequence[str | Path], index: Path) -> dict[str, ListedL
 
 def _known_states(table: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
     """Return size and time of change of the logs in an index; with `deep`, of decoded logs."""
-    known = table.filter(
-        pc.and_(pc.not_equal(table["changed"], ""), pc.or_(table["deep"], not deep))
-    )
+    decoded = pc.or_(table["deep"], not deep)
+    known = table.filter(pc.and_(pc.not_equal(table["changed"], ""), decoded))
     # A log that was not read may be readable now, as when the missing package is installed.
     known = known.filter(pc.not_equal(pc.fill_null(known["state"], ""), "not read"))
     columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))

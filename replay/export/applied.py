@@ -74,24 +74,23 @@ AppliedSink = Callable[[Applied], None]
 
 @contextlib.contextmanager
 def written(
-    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool, log: str | None = None
+    out: Path, spec: SourceSpec, modules: Sequence[Module], log: str | None = None
 ) -> Iterator[AppliedSink]:
-    """Open a file for outputs; it has its name once the body has ended without an error.
+    """Open a file for outputs; it replaces another once the body has ended without an error.
 
     Args:
         out: the file, .parquet, .csv or .mcap.
         spec: the spec of the source.
         modules: the modules in their order.
-        force: replace an existing file.
         log: value of a first column `log`, for a table that is one of many logs' tables.
 
     Raises:
-        UsageError: the file exists.
+        UsageError: the output is a folder or a special file.
         LogWriteError: the file cannot be written.
     """
-    refuse_taken(out, force=force)
+    refuse_taken(out, force=True)
     if out.suffix.lower() == ".mcap":
-        with _log_sink(out, spec, modules, force=force) as sink:
+        with _log_sink(out, spec, modules) as sink:
             yield sink
     else:
         with atomic_write(out) as partial, _table_sink(partial, out, spec, modules, log) as sink:
@@ -168,9 +167,7 @@ def _batch(
 
 
 @contextlib.contextmanager
-def _log_sink(
-    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool
-) -> Iterator[AppliedSink]:
+def _log_sink(out: Path, spec: SourceSpec, modules: Sequence[Module]) -> Iterator[AppliedSink]:
     """Write an MCAP file with the frames of each stream, and a topic per module and stream.
 
     The file is readable while it is written; an error leaves a readable NAME.partial.
@@ -180,7 +177,7 @@ def _log_sink(
         ImageEncoder(shape[0], shape[1], name) if len(shape) > 1 else VectorEncoder()
         for shape, name in zip(shapes, spec.streams, strict=True)
     ]
-    log = LogFile(out, force=force, compression="lz4", aside=True)
+    log = LogFile(out, force=True, compression="lz4", aside=True)
 
     def channel(topic: str, schema: str, definition: bytes) -> int:
         return log.add_channel(topic, log.add_schema(schema, ENCODING, definition))

@@ -245,8 +245,7 @@ class _RunContent(_Content):
             if not modules.is_file():
                 yield Problem(str(modules), "is missing")
             elif hashlib.sha256(read_regular(modules, MAX_BYTES)).hexdigest() != stated:
-                what = "differs from the run's final record"
-                yield Problem(str(modules), what)
+                yield Problem(str(modules), "differs from the run's final record")
             else:
                 load_modules(modules)
         except CdmisfaError as error:
@@ -281,8 +280,7 @@ def _check_views(contents: list[_ViewContent], *, alone: bool) -> Iterator[Probl
             edges = [(0, content.view.facts.first_frame), *content.view.ranges]
             for (_, end), (start, _) in itertools.pairwise(edges):
                 if start > end:
-                    what = f"frames {end} to {start - 1} are missing"
-                    yield Problem(str(content.path), what)
+                    yield Problem(str(content.path), f"frames {end} to {start - 1} are missing")
         if content.error is not None:
             yield as_problem(content.path, content.error)
     if not alone:

@@ -93,9 +93,8 @@ class Images:
         """
         name = self._streams[stream].name_of
         try:
-            return (
-                self._whole_image(stream, row) if self._skip_damaged else self._decoded(stream, row)
-            )
+            read = self._whole_image if self._skip_damaged else self._decoded
+            return read(stream, row)
         except UnknownPixels as error:
             raise UsageError(f"{name(row)}: {error}") from None
         except BROKEN as error:

@@ -137,24 +137,18 @@ class OpenLogs:
             for topic in topics:
                 if not any(fits_topic(stream.topic, [topic]) for stream in self.streams):
                     alone = replace(options, topics=(topic,))  # whose error names those there are
-                    FORMATS[log_format(files[0])](
-                        files[0], alone, opened, skip_damaged=skip_damaged
-                    )
-            self.streams.sort(
-                key=lambda s: next(
-                    (i for i, t in enumerate(topics) if fits_topic(s.topic, [t])), len(topics)
-                )
-            )
+                    FORMATS[log_format(files[0])](files[0], alone, opened)
+
+            def place(stream: LogStream) -> int:
+                return [*(fits_topic(stream.topic, [t]) for t in topics), True].index(True)
+
+            self.streams.sort(key=place)
 
 
 @contextlib.contextmanager
-def open_stream(
-    path: Path, topic: str | None = None, options: InputOptions | None = None
-) -> Iterator[LogStream]:
+def open_stream(path: Path, topic: str | None = None) -> Iterator[LogStream]:
     """Open one stream of a log; raises as `OpenLogs`."""
-    options = options or InputOptions()
-    if topic is not None:
-        options = replace(options, topics=(topic,))
+    options = InputOptions() if topic is None else InputOptions(topics=(topic,))
     with ExitStack() as opened:
         yield FORMATS[log_format(path)](path, options, opened)[0]
 

@@ -369,9 +369,7 @@ class LoggedSource(StoredSource):
         options = self._options
         chosen: dict[str, Any] = {}
         if any(self.pauses.values()):
-            chosen["gaps"] = {
-                name: [list(gap) for gap in spans] for name, spans in self.pauses.items()
-            }
+            chosen["gaps"] = {s: [*map(list, spans)] for s, spans in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if options.fit != "crop" or any(framing.lossy for framing in self.framings if framing):
             chosen["fit"] = options.fit

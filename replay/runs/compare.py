@@ -195,11 +195,8 @@ def outcome(outline: Outline, *, timed: bool = False) -> dict[str, str]:
     """
     outcomes = {}
     for s, name in enumerate(outline.names()):
-        modules = [
-            f"module {save.module}" + (f" at {save.iteration}" if timed else "")
-            for save in outline.saved
-            if save.stream == s
-        ]
+        saved = [save for save in outline.saved if save.stream == s]
+        modules = [f"module {m.module}{f' at {m.iteration}' if timed else ''}" for m in saved]
         state = outline.states[s]
         without = "no module" if state < 0 else STATE_WORDS[state]
         outcomes[name] = ", ".join(modules) or without

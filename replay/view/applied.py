@@ -88,22 +88,18 @@ class ViewSink:
 
 
 @contextlib.contextmanager
-def written_view(
-    out: Path, spec: SourceSpec, modules: Sequence[Module], *, force: bool
-) -> Iterator[AppliedSink]:
+def written_view(out: Path, spec: SourceSpec, modules: Sequence[Module]) -> Iterator[AppliedSink]:
     """Yield a sink that writes a view of modules' outputs, whole when the body has ended.
 
     Args:
         out: the file.
         spec: specification of the source.
         modules: the modules in order.
-        force: replace an existing file.
 
     Raises:
-        UsageError: it exists.
         CdmisfaError: it cannot be written.
     """
-    with recording_to(out, out.stem, out, force=force) as recording:
+    with recording_to(out, out.stem, out, force=True) as recording:
         view = ViewSink(recording, spec, modules)
         yield view.add
         view.close()

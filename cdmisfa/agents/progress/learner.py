@@ -181,6 +181,7 @@ class ProgressLearner:
         slowness = [kernels.instantaneous_slowness(y) for y in y_frozen]
         y = self._kinds.wide(candidate.y)
         shape = (count, self._n_outputs)
+        etas = [self._kinds.wide(module.eta) for module in self.modules[:count]]
         signals: dict[str, Any] = {
             "novel": undecided and candidate.varies,
             "known_by": int(row["module"]) + 1 if candidate.varies else -1,
@@ -191,9 +192,7 @@ class ProgressLearner:
             "eta": self._kinds.wide(tested),
             "eta_inst": kernels.instantaneous_slowness(y),
             "eta_inst_frozen": np.array(slowness).reshape(shape),
-            "band_mean": np.array([self._kinds.wide(m.eta) for m in self.modules[:count]]).reshape(
-                shape
-            ),
+            "band_mean": np.array(etas).reshape(shape),
             "curiosity": gained,
             "reward": gained,
             "R": np.empty((0, 2, 0)),

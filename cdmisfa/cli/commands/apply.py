@@ -217,7 +217,7 @@ def _apply(
     totals, sinks = Totals(spec, modules), []
     with bar("applying", "frames") as progress_bar, contextlib.ExitStack() as stack:
         if output is not None:
-            sinks.append(stack.enter_context(written_to(output, spec, modules, force=True)))
+            sinks.append(stack.enter_context(written_to(output, spec, modules)))
         if as_lines:
             sinks.append(lambda block: printing.line(json_line(block, spec, modules)))
         blocks = stack.enter_context(contextlib.closing(application.to(source, frames, stop)))

@@ -107,13 +107,8 @@ def sweep_command(
         )
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
-        printing.document(
-            sweep=report.folder,
-            trials=report.trials,
-            skipped=report.skipped,
-            computed=report.computed,
-            failed=failed,
-        )
+        counts = {name: getattr(report, name) for name in ("trials", "skipped", "computed")}
+        printing.document(sweep=report.folder, **counts, failed=failed)
     else:
         printing.line(
             f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
@@ -228,21 +223,16 @@ def reproduce_command(
         cdmisfa reproduce icub --recording recordings/table --jobs 4
         cdmisfa reproduce all -o reproduction --jobs 8
     """
-    from cdmisfa.studies.paper.reproduce import (
-        EXPERIMENTS,
-        check_claims,
-        markdown_tables,
-        reproduce,
-    )
+    from cdmisfa.studies.paper import reproduce as paper
 
     root, documents = output or Path("reproduction"), []
-    for experiment in EXPERIMENTS if name == "all" else (name,):
+    for experiment in paper.EXPERIMENTS if name == "all" else (name,):
         if experiment == "icub" and recording is None:
             printing.status(
                 f"icub: the scene is recorded into {root}/icub-recording, if not yet done"
             )
         with bar(experiment, "trials") as progress_bar:
-            document = reproduce(
+            document = paper.reproduce(
                 experiment,
                 root / experiment,
                 recording=recording,
@@ -253,9 +243,9 @@ def reproduce_command(
     if as_json:
         printing.document(experiments=documents)
     else:
-        printing.text("\n".join(f"{d['title']}\n\n{markdown_tables(d)}" for d in documents))
+        printing.text("\n".join(f"{d['title']}\n\n{paper.markdown_tables(d)}" for d in documents))
     for document in documents:
-        check_claims(document)
+        paper.check_claims(document)
 
 
 @options.command("demo")

@@ -104,7 +104,6 @@ def streams(
     """Open the topics of a .bag, .db3 or rosbag2's folder.
 
     Raises:
-        MissingPackageError: rosbags is not installed.
         UsageError: no such topic, or it has no images or fields as requested.
         LogDamagedError: rosbags cannot read it.
     """
@@ -135,7 +134,6 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
         whole: read every message in any case.
 
     Raises:
-        MissingPackageError: rosbags is not installed.
         LogDamagedError: rosbags cannot read it.
     """
     with open_bag(path) as bag:

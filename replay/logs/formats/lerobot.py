@@ -210,8 +210,8 @@ def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptio
     )
     widths = {name: math.prod(dataset.info["features"][name].get("shape", ())) for name in names}
     columns = [column for name in names for column in column_names(name, widths[name])]
-    stream = replace(stream, fields=names, columns=lambda: columns)
-    return replace(stream, warnings=[*stream.warnings, *dataset.notes(what)])
+    warnings = [*stream.warnings, *dataset.notes(what)]
+    return replace(stream, fields=names, columns=lambda: columns, warnings=warnings)
 
 
 def is_dataset(path: Path) -> bool:
