@@ -81,9 +81,8 @@ class CuriousLearner:
             limit = f"more than the {inputs} inputs: set it to at most {inputs}"
             raise UsageError(f"learner.components is {config.components}, {limit}")
         self.scale = PIXEL if spec.dtype == "uint8" else 1.0
-        self.policy_rng = np.random.Generator(
-            np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
-        )
+        draws = np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,))
+        self.policy_rng = np.random.Generator(np.random.PCG64(draws))
         n_streams = len(spec.streams)
         first = int(self.policy_rng.random() * n_streams)
         self.rules = rules(config, n_streams)

@@ -144,8 +144,8 @@ class Session:
         spec_then, spec_now = (spec.as_json() for spec in (header.spec, source.spec))
         then = {**header.manifest, "source": source_then, "spec": spec_then, COMMAND: None}
         now = {**as_json, "source": source_now, "spec": spec_now, COMMAND: None}
-        found = (entry for entry in differences(then, now) if entry[0] not in OF_PASSES)
-        changed = {key.removeprefix("config."): values for key, *values in found}
+        entries = (entry for entry in differences(then, now) if entry[0] not in OF_PASSES)
+        changed = {key.removeprefix("config."): values for key, *values in entries}
         if changed:
             # Another learner has other keys, so its name is the reason for all differences.
             key = "learner.algorithm" if "learner.algorithm" in changed else next(iter(changed))
@@ -337,8 +337,7 @@ class Session:
                 log.event(keyframe.t, max(at - 1, 0), f"resumed at iteration {at}")
             else:
                 text = [f"fork of {fork['parent']} after {at} iterations"]
-                for name, (value_before, now) in fork["changed"].items():
-                    text.append(f"{name} is {now}, was {value_before}")
+                text += [f"{k} is {now}, was {was}" for k, (was, now) in fork["changed"].items()]
                 log.event(keyframe.t, max(at - 1, 0), "; ".join(text))
                 log.keyframe(keyframe, again=True)
         log.sync()
