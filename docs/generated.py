@@ -18,9 +18,8 @@ from typing import Any
 
 import click
 
-from cdmisfa.cli import interrupts
 from cdmisfa.cli.app import HEADINGS, cli
-from cdmisfa.core import errors
+from cdmisfa.core import errors, interrupts
 from cdmisfa.core.signals import SIGNALS
 from cdmisfa.experiments.documents import markdown
 

@@ -15,7 +15,7 @@ import pytest
 from conftest import Cdmisfa, Outcome
 from folders import contents
 
-from cdmisfa.cli.interrupts import SIGNALS
+from cdmisfa.core.interrupts import SIGNALS
 
 LEARN = ("learn", "oscillatory", "--set", "learner.tau=10", "--max-iterations", 3)
 RECORD = ("record", "oscillatory", "--frames", 20, "--view", "x1")

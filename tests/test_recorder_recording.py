@@ -111,7 +111,7 @@ def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
 RECORD = """
 import sys
 from pathlib import Path
-from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.core.interrupts import stoppable
 from recorder.recording import RecordingStoppedError, record, record_scene
 if __name__ == "__main__":
     with stoppable() as stop:

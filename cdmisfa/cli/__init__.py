@@ -6,7 +6,7 @@ from typing import NoReturn
 
 def main() -> NoReturn:
     """Run the command line of this process."""
-    from cdmisfa.cli.interrupts import exit_on_signals
+    from cdmisfa.core.interrupts import exit_on_signals
 
     exit_on_signals()  # imports take long enough for a Ctrl-C
     from cdmisfa.cli import app

@@ -19,10 +19,10 @@ from typing import NoReturn
 
 import click
 
-from cdmisfa.cli.interrupts import exit_on_signals, ignore_signals_at_exit, interruptible
 from cdmisfa.cli.options import quiet
 from cdmisfa.cli.printing import Stderr, line
 from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.interrupts import exit_on_signals, ignore_signals_at_exit, interruptible
 
 # Commands by their heading on the help page.
 HEADINGS = {

@@ -9,16 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.printing import Stderr, status
+from cdmisfa.core.interrupts import stoppable
 from cdmisfa.core.learning import Sink
 from cdmisfa.core.untrusted import printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from cdmisfa.cli.interrupts import Stop
     from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
+    from cdmisfa.core.interrupts import Stop
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import signal
 import tempfile
-import threading
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, description
+from cdmisfa.core.interrupts import stoppable
 from cdmisfa.core.learning import Sink
 from cdmisfa.experiments.holdout import arrange_frames
 from cdmisfa.experiments.run_folder import command_of
@@ -158,24 +156,12 @@ def _interruptible(folder: Path, stop: Callable[[], bool]) -> Iterator[Callable[
     Yields:
         `stop` of the run, which is also true after Ctrl-C.
     """
-    pressed: list[int] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if pressed:
-            raise KeyboardInterrupt
-        pressed.append(number)
-        os.write(2, b"finishing; press Ctrl-C again to stop at once\n")
-
-    plain = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    ours = plain and threading.current_thread() is threading.main_thread()
-    if ours:
-        signal.signal(signal.SIGINT, handle)
-    try:
-        yield lambda: bool(pressed) or stop()
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-    if pressed:
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield stop
+        return
+    with stoppable(signals=[signal.SIGINT]) as pressed:
+        yield lambda: pressed() or stop()
+    if pressed():
         raise KeyboardInterrupt(f"the run is saved: {folder}")
 
 

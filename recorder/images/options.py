@@ -164,9 +164,8 @@ class InputOptions(InputConfig):
     @property
     def config(self) -> InputConfig:
         """The keys `input.*`."""
-        return InputConfig(
-            **{field.name: getattr(self, field.name) for field in fields(InputConfig)}
-        )
+        names = (field.name for field in fields(InputConfig))
+        return InputConfig(**{name: getattr(self, name) for name in names})
 
     def configured(self, *layers: Mapping[str, Any]) -> InputOptions:
         """Return the options with keys `input.*` from layers of values; later layers override.

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.cli.interrupts import SIGNALS
+from cdmisfa.core.interrupts import SIGNALS
 
 from .cases import REFUSED, RIGHT, Defect
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options, printing
-from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import bar, resumable_bar
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.interrupts import Stop, stoppable
 from cdmisfa.core.names import counted
 
 if TYPE_CHECKING:

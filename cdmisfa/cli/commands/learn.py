@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options, printing
-from cdmisfa.cli.interrupts import Stop
 from cdmisfa.cli.progress import RunProgress, bar, learning
 from cdmisfa.core.errors import LogDamagedError, UsageError, are_for, one_line
+from cdmisfa.core.interrupts import Stop
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource

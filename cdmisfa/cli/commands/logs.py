@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options, printing
-from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.interrupts import stoppable
 from cdmisfa.core.names import counted, duration_text
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options, printing
-from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import LogDamagedError, UsageError, are_for
+from cdmisfa.core.interrupts import Stop, stoppable
 
 if TYPE_CHECKING:
     from recorder.images.options import InputOptions
@@ -242,7 +242,7 @@ def convert_command(
 
 
 @contextlib.contextmanager
-def _writing(output: Path, title: str, **notice: str) -> Iterator[tuple[Bar, Stop]]:
+def _writing(output: Path, title: str, **notice: Any) -> Iterator[tuple[Bar, Stop]]:
     """Show the progress of writing a recording; exit if a signal stops it."""
     from recorder.recording import RecordingStoppedError
 

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
@@ -74,13 +74,16 @@ def exit_on_signals(code: int | None = None) -> None:
 
 
 @contextmanager
-def stoppable(notice: str = "finishing; press Ctrl-C again to stop at once\n") -> Iterator[Stop]:
+def stoppable(
+    notice: str = "finishing; press Ctrl-C again to stop at once\n",
+    signals: Collection[signal.Signals] = SIGNALS,
+) -> Iterator[Stop]:
     """Let the body finish its step at the first signal, and print `notice`; the second interrupts.
 
     Yields:
         A `Stop` that becomes true with the first signal.
     """
-    stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
+    stop, outer = Stop(), {int(number): signal.getsignal(number) for number in signals}
 
     def request_stop(number: int, frame: FrameType | None) -> None:
         if stop.number:
@@ -91,7 +94,7 @@ def stoppable(notice: str = "finishing; press Ctrl-C again to stop at once\n") -
         # not print(), which cannot be called while it prints
         os.write(2, notice.encode())
 
-    with _handled_by(request_stop):
+    with _handled_by(request_stop, signals):
         yield stop
 
 
@@ -102,13 +105,16 @@ def ignore_signals_at_exit() -> None:
 
 
 @contextmanager
-def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+def _handled_by(
+    handler: Callable[[int, FrameType | None], None],
+    signals: Collection[signal.Signals] = SIGNALS,
+) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
         _leave_closed_terminal()
         handler(number, frame)
 
     try:
-        before = {number: signal.signal(number, handle) for number in {*SIGNALS} - _ignored()}
+        before = {number: signal.signal(number, handle) for number in {*signals} - _ignored()}
     except ValueError:  # not the main thread: signals are not ours to handle
         yield
         return
