@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.logs.clock import by_time, counts, overlap
+from replay.logs.clock import by_time, counts, overlap, step_of
 from replay.logs.stream import LAST_NS, LogStream
 
 START = 1_700_000_000 * NANOSECONDS
@@ -23,6 +23,12 @@ GAPS = st.lists(st.integers(0, 10**9), min_size=1, max_size=30)
 
 def times(*gaps: int) -> IntArray:
     return np.array(list(accumulate(gaps, initial=START)), np.int64)
+
+
+def test_times_in_whole_milliseconds_have_the_rate_of_all_steps() -> None:
+    stamps = np.round(np.arange(3001) * 1000 / 30).astype(np.int64) * 10**6
+    lost = np.delete(stamps, slice(50, 3000, 50))
+    assert [round(step_of(each) * 30, 4) for each in (stamps, lost)] == [1, 1]
 
 
 @given(GAPS, GAPS, st.floats(0.5, 100))

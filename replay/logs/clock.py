@@ -158,8 +158,15 @@ def overlap(streams: Sequence[IntArray]) -> tuple[int, int]:
 
 
 def step_of(times: IntArray) -> float:
-    """Return the median time between rows, in seconds; NaN of fewer than two."""
-    return float(np.median(np.diff(times)) / NANOSECONDS) if len(times) > 1 else float("nan")
+    """Return the typical time between rows, in seconds; NaN of fewer than two.
+
+    It is the mean of the steps near their median, which times in whole milliseconds shift.
+    """
+    if len(times) < 2:
+        return float("nan")
+    steps = np.sort(np.diff(times))
+    median = steps[(len(steps) - 1) // 2]
+    return float(steps[np.abs(steps - median) <= median / 4].mean() / NANOSECONDS)
 
 
 def unlike(first: IntArray, times: IntArray) -> str:
