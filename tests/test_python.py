@@ -7,6 +7,7 @@ import gc
 import os
 import signal
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -223,6 +224,15 @@ class Press(cdmisfa.Sink):
                 signal.sigpending()  # Python runs the handler between two bytecodes
 
 
+@pytest.fixture
+def default_handler() -> Iterator[None]:
+    """Handle Ctrl-C as Python does; a process started in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("default_handler")
 def test_ctrl_c_saves_the_run_and_raises(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     np.save(tmp_path / "x.npy", numbers(2000))
     source, folder = str(tmp_path / "x.npy"), tmp_path / "run"
