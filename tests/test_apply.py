@@ -198,3 +198,14 @@ def test_a_reader_that_goes_away_ends_it(run: Path) -> None:
         command.stdout.close()
         assert command.wait(30) == 1
         assert "Traceback" not in command.stderr.read()
+
+
+def test_a_table_is_read_at_the_times_of_the_run(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    rows = "".join(f"{i / 30:.6f},{np.sin(i / 9) + i % 3 / 10}\n" for i in range(600))
+    (tmp_path / "t.csv").write_text("stamp,a\n" + rows)
+    settings = ("--set", "input.time=stamp", "--set", "input.holdout=0", "--max-iterations", 600)
+    cdmisfa("learn", tmp_path / "t.csv", *settings, "-o", tmp_path / "run", "--no-rerun")
+    named = cdmisfa("apply", tmp_path / "run", tmp_path / "t.csv", *settings[:2], "--json")
+    applied = cdmisfa("apply", tmp_path / "run", tmp_path / "t.csv", "--json")
+    assert applied.json == named.json
+    assert (applied.json["logs"][0]["notes"], applied.json["logs"][0]["frames"]) == ([], 600)

@@ -248,3 +248,14 @@ def test_a_module_is_applied_to_the_streams_with_its_frames(
     (applied,) = cdmisfa("apply", run.path, log, "--json").json["logs"]
     pairs = {(row["stream"], row["module"]) for row in applied["modules"]}
     assert pairs == {(module.stream, module.index) for module in run.modules}
+
+
+def test_export_names_the_topics_of_a_recording_that_fit_a_form(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    np.savez(tmp_path / "both.npz", cam=images(9), arm=joints(9))
+    cdmisfa("convert", tmp_path / "both.npz", "-o", tmp_path / "both")
+    for form, topic in (("images", "/view/cam"), ("parquet", "/view/arm")):
+        command = ("export", tmp_path / "both", "-o", tmp_path / form, "--to", form)
+        assert f"with --topic {topic}" in cdmisfa(*command).err
+        assert cdmisfa(*command, "--topic", topic).code == 0

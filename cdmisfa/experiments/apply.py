@@ -88,7 +88,9 @@ class Application:
         recipes = [module.recipe or Recipe(module.frame_shape) for module in self.modules]
         self.recipe, self._recipes = recipes[0], recipes
         self._shapes = list(dict.fromkeys(recipe.shape for recipe in recipes))
-        self._topics = tuple(run.header.manifest["source"].get("topics", ()))
+        stated = run.header.manifest["source"]
+        self._topics = tuple(stated.get("topics", ()))
+        self._times = {name: stated[name] for name in ("time", "stamp") if name in stated}
         self._folder = run.log.parent
 
     @functools.cached_property
@@ -162,6 +164,8 @@ class Application:
         if how.size and how.fields:  # the log may have the same topics, images only, or numbers
             named = replace(how, topics=inputs.topics or self._topics)
             attempts = [named, how, replace(how, size=None, fit="crop", color=False)]
+        if self._times and inputs.time is None:  # the log may have the same times, or none
+            attempts = [*(replace(how, **self._times) for how in attempts), *attempts]
         for how in attempts[:-1]:
             with contextlib.suppress(UsageError):
                 return with_every_topic(lambda i: open_logs(words, inputs=i, **options), how)

@@ -13,7 +13,7 @@ from recorder.images.options import InputOptions
 from recorder.log.files import atomic_write, refuse_existing, refuse_taken
 from replay.export.frames import write_images, write_video, write_videos
 from replay.export.lerobot import write_dataset
-from replay.export.tables import NUMBERS, TABLES, write_streams
+from replay.export.tables import NUMBERS, TABLES, topics_of, write_streams
 from replay.logs.source import LoggedSource
 from replay.open_sources import Announce, holds_run, is_recording, open_for_viewing
 
@@ -120,7 +120,9 @@ def _opened(
             spec, why, count = source.spec, "", len(source.spec.streams)
             first = first or spec
             if form not in ("lerobot", *NUMBERS) and not spec.images:
-                why = "has streams of numbers: use --to parquet or --to lerobot"
+                topics = topics_of(source, images=True)
+                how = f"choose images with {topics}, or use" if topics else "use --to parquet or"
+                why = f"has streams of numbers: {how} --to lerobot"
             elif single and count > 1:
                 why = f"has {count} streams: choose a folder instead of one .{form} file"
             for name in ("streams", "frame_shape", "dtype", "truth", "fps"):

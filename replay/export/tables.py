@@ -27,6 +27,7 @@ from pyarrow.csv import CSVWriter
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, Signal
 from recorder.images.fields import column_names
+from recorder.log.messages import view_topic
 from replay.export.applied import ROWS
 from replay.logs.source import LoggedSource
 from replay.runs.columns import padded, whole_signals
@@ -120,7 +121,8 @@ def write_streams(source: LoggedSource, place: Path, form: str, *, single: bool)
         unequal = len(names) != first.shape[1] or len({"log_time", *names}) <= len(names)
         if first.ndim > 2 or unequal:
             what = "images" if first.ndim > 2 else f"columns {', '.join(names)}"
-            raise UsageError(f"{log.path}: {name} has {what}: choose numbers with --field")
+            how = (topics_of(source, images=False) if first.ndim > 2 else "") or "--field"
+            raise UsageError(f"{log.path}: {name} has {what}: choose numbers with {how}")
         kinds = {"log_time": pa.int64(), **dict.fromkeys(names, pa.float64())}
         out, schema = place if single else place / f"{name}.{form}", pa.schema(kinds)
         writer = pq.ParquetWriter if form == "parquet" else CSVWriter
@@ -130,6 +132,14 @@ def write_streams(source: LoggedSource, place: Path, form: str, *, single: bool)
                 file.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
                 count += len(times)
     return count
+
+
+def topics_of(source: LoggedSource, *, images: bool) -> str:
+    """Return the options that choose the streams of images, or of numbers; "" if there are none."""
+    named = view_topic if source.recorded else str
+    logs = enumerate(source.streams)
+    chosen = [named(s.topic) for i, s in logs if (len(source.spec.kind(i)[0]) > 1) == images]
+    return " ".join(f"--topic {topic}" for topic in chosen)
 
 
 def signals_table(run: Path, names: Sequence[str]) -> pa.Table:

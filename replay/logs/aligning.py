@@ -18,7 +18,7 @@ from recorder.images.options import InputOptions
 from replay.logs import clock as clocks
 from replay.logs.clock import FrameClock
 from replay.logs.formats.arrays import FPS
-from replay.logs.formats.table import TIME_NAMES
+from replay.logs.formats.table import TIME_NAMES, UNITS
 from replay.logs.stream import LogStream, joined
 
 
@@ -82,7 +82,8 @@ def _rate(streams: Sequence[LogStream]) -> float:
                 f"{timed.path} {why}, so it has no frame rate: set --rate in frames per second"
             )
         column = next((n for n in timed.fields if n in TIME_NAMES), "COLUMN")
-        name = f", or name the column of times and its unit with --set input.time={column}:s"
+        unit = f"its unit ({', '.join(UNITS)})"
+        name = f", or name the column of times and {unit} with --set input.time={column}:UNIT"
         hint = name if timed.read is not None else ""
         raise UsageError(f"{timed.path} has no frame rate: set --rate in frames per second{hint}")
     return float(f"{1 / step:.6g}")

@@ -170,7 +170,7 @@ def _apply_to_each(
     Further arguments go to `Application.open`.
     """
     from cdmisfa.experiments.apply import Application
-    from cdmisfa.experiments.documents import warnings_of
+    from cdmisfa.experiments.documents import about_source
 
     application = Application(run)
     rows: list[dict[str, Any]] = []
@@ -185,7 +185,7 @@ def _apply_to_each(
                 printing.status(f"{error}: the outputs before the damage are written")
                 code = totals.damaged.exit_code
             row: dict[str, Any] = {"log": " ".join(words), "out": output and str(output)}
-            row |= {"frames": totals.frames, "error": error, "warnings": warnings_of(source)}
+            row |= {"frames": totals.frames, "error": error, **about_source(source)}
             rows.append({**row, "modules": totals.rows()})
             if stop():
                 break

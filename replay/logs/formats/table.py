@@ -138,9 +138,11 @@ def number_stream(
         whole &= times >= 0
     first = where(int(np.argmin(whole)))
     if not whole.any() or (times is None and not whole.all()):
+        row = int(np.argmin(whole))
+        empty = [name for name, column in columns.items() if not np.isfinite(column[row]).all()]
         raise UsageError(
-            f"{first} has no finite number in {', '.join(columns)}: to skip such rows, set the "
-            "column of times with --set input.time=COLUMN, or choose columns with --field"
+            f"{first} has no finite number in {', '.join(empty or columns)}: to skip such rows, "
+            "set the column of times with --set input.time=COLUMN, or choose columns with --field"
         )
     rows, lines = np.flatnonzero(whole), []
     if left_out := len(whole) - len(rows):
