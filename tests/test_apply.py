@@ -209,3 +209,19 @@ def test_a_table_is_read_at_the_times_of_the_run(cdmisfa: Cdmisfa, tmp_path: Pat
     applied = cdmisfa("apply", tmp_path / "run", tmp_path / "t.csv", "--json")
     assert applied.json == named.json
     assert (applied.json["logs"][0]["notes"], applied.json["logs"][0]["frames"]) == ([], 600)
+
+
+def test_outputs_of_infinite_slowness_are_null_in_json_and_raise_no_warning(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    slow = np.sin(np.arange(6000) / 60) + np.random.default_rng(1).normal(0, 0.01, 6000)
+    np.save(tmp_path / "joints.npy", np.stack([slow, 2 * slow + 1], axis=1))
+    log, run = tmp_path / "joints.npy", tmp_path / "run"
+    assert cdmisfa("learn", log, "-o", run, "--set", "learner.expansion=none").code == 0
+    assert np.isinf(Run(run).modules[0].eta[1])
+    text = (run / "run.json").read_text()
+    stated = json.loads(text, parse_constant=pytest.fail)["result"]
+    assert stated["modules"][0]["eta"][1] is None
+    assert cdmisfa("verify", run).code == 0
+    done = cdmisfa("apply", run, log, "-o", tmp_path / "out.csv")
+    assert (done.code, done.err) == (0, "")

@@ -306,7 +306,8 @@ class _ModuleTracker:
             rate = max(min(2 * len(y) / (self._window + len(y)), 1.0), len(y) / self._frames)
             now = np.stack([values.mean(axis=0) for values in (first, *squares)])
             self._moments += rate * (now - self._moments)
-            distance = np.abs(slowness - self._centre) / self._width
+            with np.errstate(invalid="ignore"):  # an output can be infinitely fast here and there
+                distance = np.abs(slowness - self._centre) / self._width
             novelty = np.maximum.reduceat(distance, self._firsts)
         mean, power, steps = self._moments
         variance = power - mean * mean

@@ -16,7 +16,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.outcomes import EXHAUSTED
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.experiments.documents import machine, write_json, writing
+from cdmisfa.experiments.documents import machine, plain, write_json, writing
 from cdmisfa.experiments.sources import PASSES, open_logs
 from cdmisfa.modules import Module
 from recorder.cameras.words import is_live
@@ -333,7 +333,7 @@ def write_results(
         "result": result.as_json(),
     }
     optional = (COMMAND, FORK, ARITHMETIC, "versions")
-    document |= {key: manifest[key] for key in optional if key in manifest}
+    document = plain(document | {key: manifest[key] for key in optional if key in manifest})
     write_json(folder / RUN_JSON, document)
     log.close(final_record(folder, document, result.signals_sha256, view=view))
     if view:
