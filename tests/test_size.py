@@ -30,7 +30,7 @@ CEILINGS = {
     "recorder/world": 1410,
     "replay": 740,
     "replay/corpus": 755,
-    "replay/export": 762,
+    "replay/export": 764,
     "replay/integrity": 1010,
     "replay/logs": 2745,
     "replay/report": 960,

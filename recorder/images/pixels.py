@@ -50,7 +50,8 @@ _BAND: Final = 1 << 20
 
 # Losses that several decoders have.
 GRAY: Final = "colors become gray: keep them with --color on"
-HIGH_BYTE: Final = "16-bit pixels are reduced to their high byte"
+TO_8_BITS: Final = "to keep lower bits, scale its 16-bit pixels to 8 bits before"
+HIGH_BYTE: Final = f"16-bit pixels are reduced to their high byte: {TO_8_BITS}"
 ALPHA: Final = "transparency is ignored"
 
 _losses: ContextVar[list[str] | None] = ContextVar("_losses", default=None)

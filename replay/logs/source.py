@@ -18,7 +18,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.framing import Framing, framings
 from recorder.images.options import COLOR_RECIPE, InputOptions
-from recorder.images.pixels import GRAY, Content, losses
+from recorder.images.pixels import GRAY, HIGH_BYTE, TO_8_BITS, Content, losses
 from recorder.log.scenery import turns_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
@@ -123,12 +123,14 @@ class LoggedSource(StoredSource):
             self._images = images = Images(
                 self.streams, color=self.color, skip_damaged=self._skip_damaged
             )
-            firsts = []
+            firsts, how = [], self._options
             for i, rows in enumerate(clock.rows):
                 with losses() as lines:
                     firsts.append(images.image(i, int(rows[0])))
                 self._losses += [(self.streams[i], line) for line in lines]
-            how = self._options
+                if how.range and HIGH_BYTE in lines:
+                    here = f"{self.streams[i].path}: {self.streams[i].topic}"
+                    raise UsageError(f"{here} has no distances for input.range: {TO_8_BITS}")
             self.framings = made = framings(firsts, how.size, how.fit, color=self.color)
             kinds = [framing.kind for framing in made]
             self._spec = SourceSpec.of_kinds(names, kinds, (), self._fps, clock.start_ns, length)
