@@ -171,6 +171,7 @@ ROWS: dict[str, tuple[Write, str, str]] = {
     "images colors": (images(files(ramp(3))), "", GRAY),
     "images alpha": (images(files(ramp(4))), "", ALPHA),
     "images 16 bit": (images(files(WORDS)), "", HIGH),
+    "images later colors": (images([*files(ramp()), *files(ramp(3))]), "", GRAY),
     "images exif": (images(files(ramp(), "JPEG", exif=TURNED), "jpg"), "", EXIF),
     "images large": (images(files(LARGE)), "", ": 192x144, resized to"),
     "npy int64": (array(BIG), "", ROUNDED),

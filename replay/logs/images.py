@@ -12,7 +12,7 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.processes import thread_count
 from recorder.images.compressed import MAX_THREAD_PIXELS, compressed_image
-from recorder.images.pixels import Content, UnknownPixels
+from recorder.images.pixels import Content, UnknownPixels, losses, lost
 from replay.logs.stream import BROKEN, LogStream
 
 REMEDY: Final = "learn, convert and apply replace broken images with --skip-damaged"
@@ -39,7 +39,7 @@ class Images:
     def __init__(self, streams: Sequence[LogStream], *, color: bool, skip_damaged: bool) -> None:
         self._streams, self._color, self._skip_damaged = streams, color, skip_damaged
         self._threads = ThreadPoolExecutor(CORES)
-        self._pending: dict[StreamRow, Future[ByteArray] | None] = {}
+        self._pending: dict[StreamRow, Future[tuple[ByteArray, list[str]]] | None] = {}
         self._coming: Iterator[StreamRow] = iter(())
         self._whole: dict[int, tuple[int, Content]] = {}
         self._broken: dict[int, dict[int, LogDamagedError]] = {}
@@ -56,7 +56,12 @@ class Images:
         """Return an image; None if no thread has decoded it, or the caller shall see the error."""
         coming = self._pending.pop(place, None)
         self._begin()
-        return None if coming is None or coming.exception() is not None else coming.result()
+        if coming is None or coming.exception() is not None:
+            return None
+        image, lines = coming.result()
+        for line in lines:
+            lost(line)
+        return image
 
     def close(self) -> None:
         """Decode no more, and wait for running threads; harmless when called twice."""
@@ -68,7 +73,7 @@ class Images:
         for place in itertools.islice(self._coming, max(2 * CORES - len(self._pending), 0)):
             self._pending[place] = self._decode(*place)
 
-    def _decode(self, number: int, row: int) -> Future[ByteArray] | None:
+    def _decode(self, number: int, row: int) -> Future[tuple[ByteArray, list[str]]] | None:
         """Fetch a row in this thread, and let another decode it; None for other images."""
         stream, data = self._streams[number], None
         if stream.compressed is not None:
@@ -76,9 +81,7 @@ class Images:
                 data = stream.taken(row, stream.compressed)
         if data is None:
             return None
-        return self._threads.submit(
-            compressed_image, data, color=self._color, limit=MAX_THREAD_PIXELS
-        )
+        return self._threads.submit(_image_and_losses, data, self._color)
 
     def _forget(self, place: StreamRow) -> None:
         if (coming := self._pending.pop(place)) is not None:
@@ -138,3 +141,8 @@ class Images:
                     f"{what} are broken and replaced by the last readable one"
                 )
         return lines
+
+
+def _image_and_losses(data: bytes, color: bool) -> tuple[ByteArray, list[str]]:
+    with losses() as lines:
+        return compressed_image(data, color=color, limit=MAX_THREAD_PIXELS), lines

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -57,8 +57,8 @@ class LoggedSource(StoredSource):
         in_memory: whether they are arrays of the caller.
         alignment: for each stream the counts of its rows, of repeated frames and of dropped rows.
         pauses: for each stream the frames [start, stop) of its gaps.
-        changes: for each stream whose images change their size, or whose numbers are rounded, a
-            line that says so; as soon as one was shown.
+        changes: for each stream whose images change their size or lose what the first one did not,
+            or whose numbers are rounded, a line that says so; as soon as one was shown.
 
     Raises:
         UsageError: images are smaller than a frame, or the streams need `align`.
@@ -219,9 +219,12 @@ class LoggedSource(StoredSource):
         framing, log = self.framings[stream], self.streams[stream]
         assert framing is not None
         assert self._images is not None
-        image = self._images.image(stream, row) if image is None else image
+        with losses() if log.compressed else nullcontext(list[str]()) as lines:
+            image = self._images.image(stream, row) if image is None else image
         if stream not in self.changes:
             change = framing.change(image) if image.ndim > 1 or log.read is None else ""
+            known = [line for one, line in self._losses if one is log]
+            change = change or next((line for line in lines if line not in known), "")
             if change:
                 self.changes[stream] = f"{log.name_of(row)}: {change}"
         try:
