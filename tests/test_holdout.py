@@ -142,7 +142,7 @@ def test_going_on_keeps_to_what_the_run_learns_from(
 @pytest.mark.parametrize("size", [7, 100, 5000])
 def test_slowness_in_pieces_is_that_of_all_frames(size: int) -> None:
     x = values(3000)
-    phi, mean = batch_outputs(in_pieces(x, size), len(x), components=6, outputs=2)
+    phi, mean, _ = batch_outputs(in_pieces(x, size), len(x), components=6, outputs=2)
     exact = slowness((x - x.mean(axis=0)) @ batch_sfa(x, 2).T)
     np.testing.assert_allclose(mean, x.mean(axis=0), rtol=1e-9, atol=1e-12)
     (result,) = following_slowness(in_pieces(x, size), [(phi, mean)])

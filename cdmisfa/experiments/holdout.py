@@ -110,7 +110,7 @@ def evaluate(
             of_stream = [module for module in modules if module.stream_index == stream]
             pieces = functools.partial(_pieces, source, of_stream[0], stop)
             count, outputs = fitted[1] - fitted[0], len(of_stream[0].phi)
-            phi, mean = batch_outputs(pieces(*fitted), count, components, outputs)
+            phi, mean, _ = batch_outputs(pieces(*fitted), count, components, outputs)
             weights = [(module.phi, module.mean) for module in of_stream]
             *by_module, by_batch = following_slowness(pieces(*held_out), [*weights, (phi, mean)])
             for module, slowness in zip(of_stream, by_module, strict=True):

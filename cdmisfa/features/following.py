@@ -6,7 +6,7 @@ Frames are read piece by piece, so that the memory does not depend on their numb
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,22 @@ BATCH_STORED_PER_COMPONENT = 8
 TOLERANCE = 1e-10
 
 
-def batch_outputs(
-    pieces: Pieces, frames: int, components: int, outputs: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the slowest outputs of batch SFA within the leading principal components of frames.
+class BatchOutputs(NamedTuple):
+    """Outputs of batch SFA, fewer if the frames vary in fewer directions.
+
+    Attributes:
+        phi: (J, I) the slowest outputs as weights of the centred frame.
+        mean: (I,) mean of the frames.
+        directions: (K, I) the leading principal components, orthonormal, which span phi.
+    """
+
+    phi: FloatArray
+    mean: FloatArray
+    directions: FloatArray
+
+
+def batch_outputs(pieces: Pieces, frames: int, components: int, outputs: int) -> BatchOutputs:
+    """Return the slowest outputs within the leading principal components of frames.
 
     All frames have equal weights. The result is close to that of `batch_sfa` on the components, but
     not equal, because only `BATCH_STORED_PER_COMPONENT` directions a component are stored.
@@ -40,10 +52,6 @@ def batch_outputs(
         frames: total number of frames.
         components: number of components K.
         outputs: number of outputs J.
-
-    Returns:
-        (J, I) weights of the centred frame, fewer if the frames vary in fewer directions; and (I,)
-        the mean of the frames.
     """
     # A RecursiveFeature stores STORED_PER_COMPONENT directions for each of its components.
     size = BATCH_STORED_PER_COMPONENT * components // STORED_PER_COMPONENT
@@ -57,7 +65,8 @@ def batch_outputs(
     variance = variance[variance > TOLERANCE * variance.max(initial=0.0)]
     size, scale = len(variance), 1 / np.sqrt(variance)
     _, rotation = np.linalg.eigh(state.differences[:size, :size] * scale * scale[:, None])
-    return (rotation[:, :outputs].T * scale) @ state.basis[:size], state.mean
+    directions = state.basis[:size]
+    return BatchOutputs((rotation[:, :outputs].T * scale) @ directions, state.mean, directions)
 
 
 class SlownessSums:
