@@ -61,6 +61,7 @@ class TestNumbers(SourceContract):
         return open_arrays({"all": numbers(60)})
 
 
+@pytest.mark.filterwarnings("ignore:.*(bits|byte|transparency)")
 @pytest.mark.parametrize(
     ("given", "shape", "dtype"),
     [
@@ -285,6 +286,20 @@ def test_a_recording_gives_the_frames_of_its_streams() -> None:
         Recording("x.mcap", topic=["/a"])
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"a": numbers(), "b": numbers(300)}, r"\(a has 400, b has 300\): only 300 rows of each"),
+        (pictures(6, 8, 4), "stream: transparency is ignored"),
+        (pictures(6, 8).astype(np.uint16), "16-bit pixels are reduced to their high byte"),
+    ],
+)
+def test_what_a_source_drops_is_a_warning_at_the_callers_line(given: Any, said: str) -> None:
+    with pytest.warns(UserWarning, match=said) as lines:
+        learn(given, **FEW)
+    assert [line.filename for line in lines] == [__file__]
+
+
 @pytest.mark.parametrize("given", [numbers(), pictures(6, 8), {"<b>": numbers()}])
 def test_representations_are_one_short_line(given: Any) -> None:
     for described in (Recording(given), learn(given, **FEW)):
@@ -294,6 +309,7 @@ def test_representations_are_one_short_line(given: Any) -> None:
     assert len(repr(learn(given, **FEW).signals)) < 500
 
 
+@pytest.mark.filterwarnings("ignore:.*(bits|byte|transparency)")
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
 def test_modules_take_the_pictures_that_they_learned_from(kind: Any) -> None:
     t = np.arange(3000)

@@ -6,6 +6,7 @@ import contextlib
 import shutil
 import signal
 import tempfile
+import warnings
 import weakref
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 from cdmisfa.core.blocks import FrameSource, description
 from cdmisfa.core.interrupts import stoppable
 from cdmisfa.core.learning import Sink
+from cdmisfa.experiments.documents import warnings_of
 from cdmisfa.experiments.holdout import arrange_frames
 from cdmisfa.experiments.run_folder import command_of
 from cdmisfa.experiments.session import run_session
@@ -53,7 +55,7 @@ def learn(
 ) -> Run:
     """Learn slow feature modules, and return the run.
 
-    The returned run has the signals and the modules:
+    What the source drops or changes is a warning. The run has the signals and the modules:
 
         run = cdmisfa.learn(array)
         run.signals.to_pandas()
@@ -107,6 +109,8 @@ def learn(
         _interruptible(folder, stop) as stop,
     ):
         arrange_frames(frames, configuration, passes)
+        for line in (said := warnings_of(frames)):
+            warnings.warn(line, stacklevel=2)
         if command is not None:
             command = command_of(command[0], {**how, **ends, **command[1]}, folder)
         if hasattr(frames, "stop"):
@@ -124,6 +128,8 @@ def learn(
             stop=stop,
             **limits,
         )
+        for line in (line for line in warnings_of(frames) if line not in said):
+            warnings.warn(line, stacklevel=2)  # damage and changes that showed while reading
         run = Run(folder)
         if command is None and isinstance(frames, LoggedSource) and frames.in_memory:
             run._source = Recording.of(source)  # the folder has only hashes of arrays

@@ -246,6 +246,10 @@ class LoggedSource(StoredSource):
         for stream in self.streams:
             yield from stream.warnings
         yield from (f"{log.path}: {line}" for log, line in self._losses if line != GRAY)
+        rows = {stream.topic: stream.count for stream in self.streams}
+        if self._arrays and len(set(rows.values())) > 1:
+            each = ", ".join(f"{name} has {count}" for name, count in rows.items())
+            yield f"the arrays differ in length ({each}): only {self.frames} rows of each are read"
         clock = self._clock
         handling = "no block spans a gap" if self.gaps else "the last image is repeated"
         for stream, gaps in zip(self.streams, clock.gaps, strict=True):
