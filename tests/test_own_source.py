@@ -36,6 +36,7 @@ class TestOwnSource(ForwardContract):
         return ArraySource([{**step, "right": step["left"]} for step in Robot()][:100])
 
 
+@pytest.mark.filterwarnings("ignore:.* gaps, ")
 def test_an_own_source_has_gaps_where_an_array_is_missing(tmp_path: Path) -> None:
     source = ArraySource(Robot())
     assert (source.spec.streams, source.spec.fps) == (("left", "right"), 30)
@@ -79,6 +80,7 @@ def test_a_wrong_frame_of_an_own_source_is_named(steps: list[Any], message: str)
         ArraySource(steps).take_all(2)
 
 
+@pytest.mark.filterwarnings("ignore:.*are reduced to 8 bits")
 @pytest.mark.parametrize("kind", ["f4", "i2", "u1", "?", "f8"])
 def test_an_iterator_and_an_array_give_the_same_run(kind: str) -> None:
     for shape in ((400, 3), (400,), (400, 6, 8), (400, 6, 8, 3)):

@@ -37,7 +37,7 @@ CEILINGS = {
     "replay/runs": 1410,
     "replay/storage": 290,
     "replay/view": 1960,
-    "tests": 19088,
+    "tests": 19110,
     "tools": 2080,
 }
 """Code lines allowed in each package: what it had when the ceiling was set, and 5 percent."""

@@ -109,8 +109,6 @@ def learn(
         _interruptible(folder, stop) as stop,
     ):
         arrange_frames(frames, configuration, passes)
-        for line in (said := warnings_of(frames)):
-            warnings.warn(line, stacklevel=2)
         if command is not None:
             command = command_of(command[0], {**how, **ends, **command[1]}, folder)
         if hasattr(frames, "stop"):
@@ -128,8 +126,8 @@ def learn(
             stop=stop,
             **limits,
         )
-        for line in (line for line in warnings_of(frames) if line not in said):
-            warnings.warn(line, stacklevel=2)  # damage and changes that showed while reading
+        for line in warnings_of(frames):
+            warnings.warn(line, stacklevel=2)
         run = Run(folder)
         if command is None and isinstance(frames, LoggedSource) and frames.in_memory:
             run._source = Recording.of(source)  # the folder has only hashes of arrays
