@@ -110,6 +110,8 @@ def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> 
     }
     again = cdmisfa(*swept, *LEFT, "--json").json
     assert (again["skipped"], again["computed"]) == (1, 0)
+    assert again["warnings"] == learned["warnings"]
+    assert set(again["notes"]) <= set(learned["notes"])  # learn also states the held-out frames
     later = cdmisfa(*swept, "--topic", "/left", "--start", 0.2, "--json").json
     assert (later["skipped"], later["computed"]) == (0, 1)
 

@@ -11,12 +11,13 @@ import dataclasses
 import hashlib
 import inspect
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS, learner_class
+from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
@@ -91,6 +92,7 @@ def plan(
     loop: bool = False,
     passes: int | None = None,
     inputs: InputOptions | None = None,
+    about: Callable[[FrameSource], None] = lambda logs: None,
     **limits: int | None,
 ) -> list[PlannedTrial]:
     """Check all settings, and return every trial of a sweep in the order of the grid.
@@ -104,6 +106,7 @@ def plan(
         loop: True to start a log again at its end.
         passes: see `arrange_frames`.
         inputs: how images of logs become frames; see `open_source`.
+        about: called with the opened logs.
         limits: `max_iterations` and `max_modules`, at which each trial ends.
 
     Raises:
@@ -119,6 +122,7 @@ def plan(
         inputs = read_inputs(inputs, Layers.read(preset, settings))
         with contextlib.closing(open_logs(words, loop=loop, inputs=inputs)) as logs:
             recorded, spec = dict(logs.describe()), logs.spec
+            about(logs)
     inputs = inputs or InputOptions()
     opening = {"loop": loop, "inputs": inputs}
     seeds, ends = tuple(seeds), [*map(limits.get, ("max_iterations", "max_modules")), passes]

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -16,6 +16,9 @@ from click.core import ParameterSource
 from cdmisfa.cli import options, printing
 from cdmisfa.cli.progress import Bar, bar, resumable_bar
 from cdmisfa.core.errors import CdmisfaError
+
+if TYPE_CHECKING:
+    from cdmisfa.core.blocks import FrameSource
 
 # Number of seeds of a sweep, so that a typing error does not fill the memory.
 MOST_SEEDS = 1_000_000
@@ -91,14 +94,27 @@ def sweep_command(
         raise click.UsageError("--csv needs --summary: write cdmisfa sweep DIR --summary --csv")
     if output is None:
         raise click.UsageError("name the folder of the sweep with -o, or print one with --summary")
+    from cdmisfa.experiments.documents import about_source
     from cdmisfa.experiments.sweep import sweep
 
     values, numbers, before = parse_grid(grid), parse_seeds(seeds), _requested(output)
+    stated: dict[str, list[str]] = {"warnings": [], "notes": []}
+
+    def about(logs: FrameSource) -> None:
+        printing.source(logs)
+        stated.update(about_source(logs))
+
     if algorithm is not None:
         arguments["settings"] += (f"learner.algorithm={algorithm}",)
     with resumable_bar(output, "sweep", "trials") as progress_bar:
         report = sweep(
-            source, output, grid=values, seeds=numbers, progress=progress_bar.trials, **arguments
+            source,
+            output,
+            grid=values,
+            seeds=numbers,
+            progress=progress_bar.trials,
+            about=about,
+            **arguments,
         )
     if left_out := len(before - _requested(output)):
         printing.status(
@@ -108,7 +124,7 @@ def sweep_command(
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if as_json:
         counts = {name: getattr(report, name) for name in ("trials", "skipped", "computed")}
-        printing.document(sweep=report.folder, **counts, failed=failed)
+        printing.document(sweep=report.folder, **counts, failed=failed, **stated)
     else:
         printing.line(
             f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
