@@ -27,6 +27,7 @@ Line = Callable[[Path, Path], Words]
 """Returns a command, of a damaged folder and a path for what it writes."""
 
 QUICK = ("--max-iterations", 3, "--set", "learner.tau=10", "--no-rerun", "--json")
+ONCE = ("--passes", 1)  # else a log that was cut is read again, and has other signals
 SIZE = ("--size", "16x12")
 RATE = ("--rate", 25)
 BOTH = ("--topic", "/cam_left", "--topic", "/cam_right")
@@ -56,7 +57,7 @@ def _first(place: Path) -> Path:
 
 
 def _learn(*options: object) -> Line:
-    return lambda place, out: ("learn", *sorted(place.iterdir()), *SIZE, *options, *QUICK)
+    return lambda place, out: ("learn", *sorted(place.iterdir()), *SIZE, *options, *ONCE, *QUICK)
 
 
 def _convert(*options: object) -> Line:
@@ -68,7 +69,7 @@ def _resume(place: Path, out: Path) -> Words:
 
 
 def _recorded(place: Path, out: Path) -> Words:
-    return ("learn", place, *QUICK)
+    return ("learn", place, *ONCE, *QUICK)
 
 
 LOGS: tuple[Line, ...] = (
