@@ -106,21 +106,22 @@ def _colors(frame: Any) -> ByteArray:
         return _luma(frame)
     if not _is_planar(frame, "yuv") or len(frame.format.components) < 3:
         return np.asarray(frame.to_ndarray(format="rgb24"))
-    luma = _luma(frame).astype(np.int32) << 16
+    luma = _luma(frame).astype(np.int16)
     height, width = luma.shape
-    chroma = []
-    for plane in frame.planes[1:3]:
-        values = _plane(plane, plane.height, plane.width)
-        rows, columns = -(-height // plane.height), -(-width // plane.width)
-        large = values.repeat(rows, axis=0).repeat(columns, axis=1)[:height, :width]
-        chroma.append(large.astype(np.int32) - 128)
+    planes = (_plane(plane, plane.height, plane.width) for plane in frame.planes[1:3])
+    cb, cr = (values.astype(np.int32) - 128 for values in planes)
     # Fixed-point numbers with 16 fractional bits give the same bits on every processor.
     scale = (1 if _is_full(frame) else 255 / 224) * 65536
     weights = (round(weight * scale) for weight in _WEIGHTS[frame.colorspace == _BT709])
     red, green_cb, green_cr, blue = weights
-    cb, cr = chroma
-    colors = (luma + red * cr, luma + green_cb * cb + green_cr * cr, luma + blue * cb)
-    return np.stack([((c + 32768) >> 16).clip(0, 255).astype(np.uint8) for c in colors], axis=2)
+    rows, columns = -(-height // cb.shape[0]), -(-width // cb.shape[1])
+    colors = np.empty((height, width, 3), np.uint8)
+    for channel, chroma in enumerate((red * cr, green_cb * cb + green_cr * cr, blue * cb)):
+        # Luma is whole, so that only the chroma is rounded, before it is enlarged.
+        whole = ((chroma + 32768) >> 16).astype(np.int16)
+        large = whole.repeat(rows, axis=0).repeat(columns, axis=1)[:height, :width]
+        colors[..., channel] = (luma + large).clip(0, 255)
+    return colors
 
 
 class Packet(NamedTuple):
