@@ -1,4 +1,4 @@
-"""LeRobot datasets, layout v3.0: cameras, or numbers, of all episodes, in their order.
+"""LeRobot datasets, layout v2.1 or v3.0: cameras, or numbers, of all episodes, in their order.
 
 The layout is read as it is published (github.com/huggingface/lerobot), with PyArrow and PyAV.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted import BUDGET, check_regular, read_json
+from cdmisfa.core.untrusted import BUDGET, check_regular, parse_json, read_json, read_regular
 from recorder.images.compressed import compressed_image
 from recorder.images.fields import column_names
 from recorder.images.options import RECIPE, VIDEO_RECIPE, InputOptions
@@ -32,6 +32,9 @@ INFO: Final = "meta/info.json"
 
 # Name of the layout in errors.
 LAYOUT: Final = "LeRobot's layout"
+
+# Table of episodes of layout v2.1.
+_V21: Final = "meta/episodes.jsonl"
 
 _IMAGES: Final = ("video", "image")
 
@@ -139,7 +142,8 @@ class _Camera:
         place = self._first[episode] + row - int(dataset.starts[episode])
         chunk, number = self._files[episode]
         template = dataset.info["video_path" if self.video else "data_path"]
-        name = template.format(video_key=self._topic, chunk_index=chunk, file_index=number)
+        v21 = {"episode_chunk": chunk, "episode_index": number}
+        name = template.format(video_key=self._topic, chunk_index=chunk, file_index=number, **v21)
         file = dataset.path / name
         if self._file != file:
             self.close()
@@ -259,10 +263,10 @@ def _info(path: Path) -> Any:
     with explained(path / INFO, LAYOUT):
         info = read_json(path / INFO, "it does not describe a LeRobot dataset")
         version = str(info["codebase_version"])
-        if not version.startswith("v3"):
+        if not version.startswith(("v2.1", "v3")):
             raise UsageError(
-                f"{path} is a LeRobot dataset {version}, but v3.0 is needed: convert it with "
-                "LeRobot's convert_dataset_v21_to_v30"
+                f"{path} is a LeRobot dataset {version}, but v2.1 or v3.0 is needed: convert it "
+                "with the scripts of LeRobot"
             )
         dicts = all(isinstance(feature, dict) for feature in info["features"].values())
         if not (dicts and info["fps"] > 0 and int(info["total_frames"]) >= 0):
@@ -270,11 +274,46 @@ def _info(path: Path) -> Any:
         return info
 
 
+def episode_facts(path: Path) -> list[dict[str, Any]]:
+    """Return the facts about each episode besides its files, such as `tasks`."""
+    import pyarrow.parquet as pq
+
+    if (path / _V21).is_file():
+        names = list(dict.fromkeys(name for row in _v21_episodes(path) for name in row))
+    else:
+        files = sorted((path / "meta" / "episodes").rglob("*.parquet"))[:1]
+        with limited(path, "PyArrow"):
+            names = [name for file in files for name in pq.read_schema(file).names]
+    facts = [n for n in names if "/" not in n and not n.startswith("dataset_")]
+    columns = dict.fromkeys(["episode_index", "length", *facts])
+    return [{name: row.get(name) for name in columns} for row in _episodes(path, [*columns])]
+
+
+def _v21_episodes(path: Path) -> list[dict[str, Any]]:
+    """Return the episodes of layout v2.1, with the columns that v3.0 has for their files."""
+    info, rows, start = _info(path), [], 0
+    with explained(path / _V21, LAYOUT):
+        lines = read_regular(path / _V21, BUDGET).decode().splitlines()
+        stated = [parse_json(line) for line in lines if line.strip()]
+        for row in sorted(stated, key=lambda row: int(row["episode_index"])):
+            number = int(row["episode_index"])
+            chunk = number // int(info["chunks_size"])
+            row["data/chunk_index"], row["data/file_index"] = chunk, number
+            row["dataset_from_index"], start = start, start + int(row["length"])
+            for key in features(path)[1]:
+                row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = chunk, number
+                row[f"videos/{key}/from_timestamp"] = 0.0
+            rows.append(row)
+    return rows
+
+
 def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
     """Return the rows of the tables of episodes, in their order."""
     import pyarrow.parquet as pq
 
     rows: list[dict[str, Any]] = []
+    if (path / _V21).is_file():
+        return _v21_episodes(path)
     files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
     if not files:
         raise LogDamagedError(
