@@ -9,14 +9,17 @@ import pkgutil
 import benchmarks
 from benchmarks.report import write_page
 
-# Benchmarks that run only if they are named: this one takes half an hour or more.
-ONLY_BY_NAME = {"constants"}
+# Benchmarks that run only if they are named: these take half an hour or more.
+ONLY_BY_NAME = {"constants", "episodes"}
+
+# Modules without a benchmark of their own.
+NO_BENCHMARKS = {"__main__", "arena", "paper", "report", "robot_episodes"}
 
 
 def main() -> None:
     """Run benchmarks one after another; each writes results/NAME.json, `page` the page."""
     modules = pkgutil.iter_modules(benchmarks.__path__)
-    names = sorted({m.name for m in modules} - {"__main__", "arena", "paper", "report"})
+    names = sorted({m.name for m in modules} - NO_BENCHMARKS)
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("name", nargs="*", choices=[*names, "page", []], metavar="NAME")
     parser.add_argument("--quick", action="store_true", help="fewer rounds")
