@@ -45,6 +45,7 @@ SHOWN: Mapping[str, tuple[object, ...]] = {
     "sweep": ("oscillatory", "--seeds", "0:1", "--max-iterations", 2, "-o", "sweep"),
     "sweep --summary": ("sweep", "--summary"),
     "index": ("corpus",),
+    "episodes": ("sample_logs/icub", "-o", "episodes"),
     "doctor": (),
 }
 """Commands whose documents are looked at, with what they are given."""

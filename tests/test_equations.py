@@ -10,12 +10,13 @@ from functools import cache
 import pytest
 from sources import ROOT, files, name, tree
 
-PAGE = "docs/project/contributing.md"
-EQUATIONS = [str(number) for number in range(1, 10)] + [f"P{number}" for number in range(1, 5)]
-"""The paper's equations, and the progress learner's."""
+PAGES = ("docs/project/contributing.md", "docs/how-to/find-bad-episodes.md")
+EQUATIONS = [str(number) for number in range(1, 10)]
+EQUATIONS += [f"P{number}" for number in range(1, 5)] + [f"E{number}" for number in range(1, 20)]
+"""The paper's equations, the progress learner's, and those of reasons of bad episodes."""
 
 LINE = re.compile(r"^\s*Equation:(.*)$", re.MULTILINE)
-ROW = re.compile(r"^\| \((P?\d+)\) \|.*?\| `([\w/]+\.(?:py|c))` `(\w+)` \|$", re.MULTILINE)
+ROW = re.compile(r"^\| \(([PE]?\d+)\) \|.*?\| `([\w/]+\.(?:py|c))` `(\w+)` \|$", re.MULTILINE)
 IN_C = re.compile(r"/\*((?:(?!\*/).)*)\*/\n[^\n;{(]*?(\w+)\(", re.DOTALL)
 """A comment in C, and the function that it stands before."""
 
@@ -63,6 +64,7 @@ def test_equations_are_functions() -> None:
 
 def test_the_page_says_where_every_equation_is() -> None:
     listed: dict[str, set[Place]] = {}
-    for number, file, function in ROW.findall((ROOT / PAGE).read_text("utf-8")):
+    text = "".join((ROOT / page).read_text("utf-8") for page in PAGES)
+    for number, file, function in ROW.findall(text):
         listed.setdefault(number, set()).add((file, function))
     assert listed == stated_by_number()

@@ -11,10 +11,10 @@ from pathlib import Path
 from sources import PRODUCT, ROOT, files, name, tree
 
 CEILINGS = {
-    "benchmarks": 3060,
+    "benchmarks": 3500,
     "cdmisfa": 300,
     "cdmisfa/agents": 1195,
-    "cdmisfa/cli": 2070,
+    "cdmisfa/cli": 2165,
     "cdmisfa/core": 1230,
     "cdmisfa/estimators": 250,
     "cdmisfa/experiments": 2290,
@@ -30,14 +30,15 @@ CEILINGS = {
     "recorder/world": 1410,
     "replay": 740,
     "replay/corpus": 755,
+    "replay/episodes": 1130,
     "replay/export": 764,
     "replay/integrity": 1010,
-    "replay/logs": 2745,
+    "replay/logs": 2790,
     "replay/report": 960,
     "replay/runs": 1410,
     "replay/storage": 290,
     "replay/view": 1960,
-    "tests": 19110,
+    "tests": 19330,
     "tools": 2080,
 }
 """Code lines allowed in each package: what it had when the ceiling was set, and 5 percent."""

@@ -28,13 +28,14 @@ from cdmisfa.core.interrupts import exit_on_signals, ignore_signals_at_exit, int
 HEADINGS = {
     "Learn": "record learn apply fork sweep demo reproduce",
     "Look at runs and check them": "view report compare check inspect signals",
-    "Logs and this machine": "info convert verify recover export index doctor",
+    "Logs and this machine": "info convert verify recover export index episodes doctor",
 }
 
 # Commands by their module in `cdmisfa.cli.commands`.
 MODULES = {
     "apply": "apply",
     "doctor": "doctor",
+    "episodes": "episodes",
     "learn": "learn fork",
     "logs": "info verify recover export index",
     "record": "record convert",

@@ -50,7 +50,7 @@ def report_of_run(path: Path, reproducible: str, again: str) -> tuple[str, list[
     page = ""
     for frames in FRAMES:
         data = RunData(path, frames)
-        page = _rendered(run_content(data, reproducible, again))
+        page = rendered(run_content(data, reproducible, again))
         if len(page.encode()) < MOST_BYTES:
             break
     return page, data.damage
@@ -67,7 +67,7 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
     outlines = [row.outline for row in rows]
     powers = ("learning_error", "eta_dot", "tested")  # these fall over several powers of ten
     plots = [curves(name, outlines, about, log=name in powers) for name, about in CURVES.items()]
-    return _rendered(
+    return rendered(
         {
             "kind": "runs",
             "title": title,
@@ -90,7 +90,7 @@ def report_of_runs(paths: Sequence[Path], title: str) -> str:
     )
 
 
-def _rendered(content: Mapping[str, Any]) -> str:
+def rendered(content: Mapping[str, Any]) -> str:
     """Return a page: page.html around the template that `kind` names."""
     environment, style, script = _templates()
     policy = (

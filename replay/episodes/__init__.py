@@ -1,0 +1,1 @@
+"""Find the bad episodes of a dataset, with the reasons."""
