@@ -176,16 +176,13 @@ def period(times: FloatArray) -> float:
 
 def save_measures(measured: Measured, file: Path) -> None:
     """Write the measures of an episode to an .npz file."""
-    facts = {
-        **{name: getattr(measured, name) for name in ("name", "problem", "remarks")},
-        "cameras": {name: camera.scale for name, camera in measured.cameras.items()},
-        "numbers": list(measured.numbers),
-    }
-    arrays: dict[str, Any] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
-    for place, camera in enumerate(measured.cameras.values()):
-        arrays |= {f"{name}{place}": getattr(camera, name) for name in ARRAYS}
-    for place, (times, values) in enumerate(measured.numbers.values()):
-        arrays |= {f"clock{place}": times, f"values{place}": values}
+    facts = [measured.name, measured.problem, measured.remarks]
+    cameras = {name: camera.scale for name, camera in measured.cameras.items()}
+    arrays: dict[str, Any] = {"facts": np.array(json.dumps([*facts, cameras, [*measured.numbers]]))}
+    for name, camera in measured.cameras.items():
+        arrays |= {f"{array} {name}": getattr(camera, array) for array in ARRAYS}
+    for kind, rows in measured.numbers.items():
+        arrays |= {f"{i} {kind}": array for i, array in enumerate(rows)}
     with atomic_write(file) as partial, open(partial, "wb") as out:
         np.savez(out, **arrays)
 
@@ -194,14 +191,12 @@ def load_measures(file: Path) -> Measured | None:
     """Return the measures in a file; None if there is none, or it is damaged."""
     try:
         with open(file, "rb") as stored, np.load(stored) as arrays:
-            facts = json.loads(arrays["facts"].tobytes())
-            for place, (name, scale) in enumerate(facts["cameras"].items()):
-                parts: dict[str, Any] = {array: arrays[f"{array}{place}"] for array in ARRAYS}
-                facts["cameras"][name] = CameraMeasures(**parts, scale=scale)
-            facts["numbers"] = {
-                kind: (arrays[f"clock{place}"], arrays[f"values{place}"])
-                for place, kind in enumerate(facts["numbers"])
-            }
-            return Measured(**facts)
+            name, problem, remarks, scales, kinds = json.loads(str(arrays["facts"]))
+            cameras = dict[str, CameraMeasures]()
+            for camera, scale in scales.items():
+                parts: Any = {array: arrays[f"{array} {camera}"] for array in ARRAYS}
+                cameras[camera] = CameraMeasures(**parts, scale=scale)
+            numbers = {kind: (arrays[f"0 {kind}"], arrays[f"1 {kind}"]) for kind in kinds}
+            return Measured(name, cameras, numbers, problem, remarks)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 import itertools
 import math
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,9 +29,6 @@ from replay.storage.location import location
 
 # Folder with the measures of each episode, so that the command continues.
 MEASURES: Final = "measured"
-
-# Episodes that a process measures before it reports: a video file stays open for them.
-BATCH: Final = 8
 
 # Score of an episode that cannot be read, or lacks a camera that the others have.
 UNREADABLE: Final = 100.0
@@ -133,8 +129,7 @@ def rank_episodes(
     out: Path,
     *,
     by: str | None = None,
-    state: Sequence[str] = (),
-    action: Sequence[str] = (),
+    topics: Mapping[str, Sequence[str]] | None = None,
     jobs: int = 1,
     progress: Callable[[float, float | None], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
@@ -145,11 +140,10 @@ def rank_episodes(
         words: LeRobot datasets, folders, patterns and files.
         out: folder of the results; it keeps the measures.
         by: column of the dataset whose values are groups; None: tasks, and views as detected.
-        state: topics or features of joint states; empty: reasons by their type and name.
-        action: the same of actions.
+        topics: topics or features of "state" and "action"; those that lack are found by themselves.
         jobs: number of processes; the result does not depend on it.
         progress: called with the number of episodes that are measured, and of all.
-        stop: called after each batch; true ends the work.
+        stop: called after each episode; true ends the work.
 
     Returns:
         The episodes; None if it was stopped before all were measured.
@@ -161,44 +155,38 @@ def rank_episodes(
     folder = out / MEASURES
     make_folder(folder)
     with locked_folder(out):
-        logs = list_episodes(words, out)
-        files = [folder / f"{log.key(state, action)}.npz" for log in logs]
+        logs = list_episodes(words, out, topics or {})
+        files = [folder / f"{log.key()}.npz" for log in logs]
         for stale in {*folder.glob("*.npz")} - {*files}:
             stale.unlink()
-        missing = [(log, file) for log, file in zip(logs, files, strict=True) if not file.exists()]
+        measured = dict(enumerate(map(load_measures, files)))
+        missing = [i for i, one in measured.items() if one is None]
         done = len(files) - len(missing)
-        size = max(min(BATCH, len(missing) // (4 * jobs)), 1)
-        tasks = [missing[at : at + size] for at in range(0, len(missing), size)]
         progress(done, len(files))
-        work = functools.partial(_measure_all, state=state, action=action)
-        for _, count in run_all(work, tasks, jobs=min(jobs, len(tasks))):
-            done += count
+        tasks = [(logs[i], files[i]) for i in missing]
+        for place, one in run_all(_measured, tasks, jobs=jobs):
+            measured[missing[place]] = one
+            done += 1
             progress(done, len(files))
             if stop() and done < len(files):
                 return None
-        measured = []
-        for log, file in zip(logs, files, strict=True):
-            if (one := load_measures(file)) is None:  # the file is damaged
-                one = measure_episode(log, state, action)
-                save_measures(one, file)
-            measured.append(one)
-    if all(one.problem for one in measured):
-        raise UsageError(measured[0].problem)
-    return compare(logs, measured, by)
+    episodes = [one for one in measured.values() if one is not None]
+    if all(one.problem for one in episodes):
+        raise UsageError(episodes[0].problem)
+    return compare(logs, episodes, by)
 
 
-def _measure_all(
-    tasks: Sequence[tuple[EpisodeLog, Path]], state: Sequence[str], action: Sequence[str]
-) -> int:
+def _measured(task: tuple[EpisodeLog, Path]) -> Measured:
+    """Measure an episode, and store the measures."""
     # glibc maps memory of more than 128 KiB anew for each array, which takes as long as decoding,
     # until an array is freed that was larger, of at most 32 MiB.
     np.empty(30 << 20, np.uint8)
-    for log, file in tasks:
-        save_measures(measure_episode(log, state, action), file)
-        # glibc does not reuse all memory of closed videos: 50 MB remain of each.
-        with suppress(AttributeError):
-            ctypes.CDLL(None).malloc_trim(0)
-    return len(tasks)
+    measured = measure_episode(task[0])
+    save_measures(measured, task[1])
+    # glibc does not reuse all memory of closed videos: 50 MB remain of each.
+    with suppress(AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+    return measured
 
 
 def compare(logs: list[EpisodeLog], measured: list[Measured], by: str | None = None) -> Ranked:

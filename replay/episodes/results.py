@@ -17,7 +17,7 @@ from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.names import counted
 from recorder.log.files import atomic_write
 from replay.episodes.ranking import Ranked, column_name
-from replay.episodes.reading import OpenEpisode
+from replay.episodes.reading import open_cameras, seconds
 from replay.report.page import rendered
 from replay.report.svg_plot import WIDE, Axis, Plot
 
@@ -73,9 +73,9 @@ def _entry(ranked: Ranked, episode: int) -> dict[str, Any]:
     column = reasons[0][1] if reasons else None
     images: list[tuple[str, str, bool]] = []
     with suppress(CdmisfaError, OSError), ExitStack() as opened:
-        cameras = OpenEpisode(log, opened, (), ()).cameras
-        camera = next((c for c in cameras if column and c.name == column.camera), cameras[0])
-        times = camera.times - camera.times[0]
+        cameras = open_cameras(log, opened)
+        camera = cameras.get(column.camera if column else "", next(iter(cameras.values())))
+        times = seconds(camera) - seconds(camera)[0]
         rows = {int(row) for row in np.linspace(0, len(times) - 1, IMAGES + 2)[1:-1]}
         moment = -1
         if column is not None and np.isfinite(column.at[episode]):
