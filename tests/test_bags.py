@@ -56,11 +56,14 @@ def ros1_bag(folder: Path) -> Path:
     return path
 
 
-def ros2_bag(folder: Path, plugin: str = "SQLITE3") -> Path:
+def ros2_bag(folder: Path, plugin: str = "SQLITE3", *, packed: bool = False) -> Path:
     path = folder / "cameras"
     store = get_typestore(Stores.ROS2_HUMBLE)
     storage = rosbag2.StoragePlugin[plugin]
-    with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
+    writer = rosbag2.Writer(path, version=9, storage_plugin=storage)
+    if packed:
+        writer.set_compression(rosbag2.CompressionMode.FILE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
         fill(writer, store, store.serialize_cdr, False)
     return path
 
@@ -73,7 +76,15 @@ def ros2_mcap(folder: Path) -> Path:
     return ros2_bag(folder, "MCAP")
 
 
-BAGS = [ros1_bag, ros2_bag, ros2_database, ros2_mcap]
+def ros2_packed(folder: Path) -> Path:
+    return ros2_bag(folder, packed=True)
+
+
+def ros2_packed_mcap(folder: Path) -> Path:
+    return ros2_bag(folder, "MCAP", packed=True)
+
+
+BAGS = [ros1_bag, ros2_bag, ros2_database, ros2_mcap, ros2_packed, ros2_packed_mcap]
 
 
 @pytest.mark.parametrize("make", BAGS)

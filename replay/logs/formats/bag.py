@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import zstandard
 
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
+from cdmisfa.core.untrusted import check_regular
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import InputOptions
-from recorder.mcap.records import MAX_CHUNK
 from replay.logs.formats.messages import choose_topics, left_out, message_stream
 from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, limited
 
@@ -30,22 +25,18 @@ METADATA: Final = "metadata.yaml"
 # Largest metadata.yaml that is read, in bytes.
 MAX_METADATA: Final = 1024 * 1024
 
-# Largest ratio of unpacked to packed size, against files that would fill the disk. Contents up to
-# the size of a chunk are always accepted. Only images of one color exceed the ratio.
-MOST_TIMES: Final = 100
-
 
 class Bag(NamedTuple):
-    """An open bag: readers of rosbags for its parts, one after the other, and its format."""
+    """An open bag: its reader of rosbags, and its format."""
 
     path: Path
-    readers: Sequence[Any]
+    reader: Any
     ros1: bool
 
     def kinds(self) -> dict[str, MessageKind]:
         """Return the kind of each topic's messages; in ROS 1 each publisher is a connection."""
         kinds_by_topic = {}
-        for connection in (c for reader in self.readers for c in reader.connections):
+        for connection in self.reader.connections:
             definition = str(connection.msgdef.data).encode()
             name, idl = str(connection.msgtype), connection.msgdef.format.name == "IDL"
             kind = MessageKind(name, "cdr", definition, "ros2idl" if idl else "ros2msg")
@@ -58,14 +49,15 @@ class Bag(NamedTuple):
         self, topics: Sequence[str], start: int | None = None
     ) -> Iterator[tuple[str, int, Any]]:
         """Yield topic, time and data of each message on some topics, from a time on."""
-        for reader in self.readers:
-            if chosen := [c for c in reader.connections if c.topic in topics]:
-                for connection, stamp, data in reader.messages(chosen, start):
-                    yield str(connection.topic), stamp, data
+        if chosen := [c for c in self.reader.connections if c.topic in topics]:
+            for connection, stamp, data in self.reader.messages(chosen, start):
+                yield str(connection.topic), stamp, data
 
     def stamps(self, topics: Sequence[str]) -> Iterator[tuple[str, int]]:
-        """Yield topic and time of each message on some topics, of a rosbag2 without its data."""
-        if self.ros1:
+        """Yield topic and time of each message on some topics, of SQLite without its data."""
+        storage = getattr(self.reader, "storage", None)
+        storages = getattr(storage, "storages", [storage])
+        if not all(hasattr(storage, "dbconn") for storage in storages):
             yield from ((topic, stamp) for topic, stamp, _ in self.messages(topics))
             return
         query = (
@@ -73,9 +65,8 @@ class Bag(NamedTuple):
             "JOIN topics ON messages.topic_id = topics.id "
             f"WHERE topics.name IN ({','.join('?' * len(topics))}) ORDER BY messages.timestamp"
         )
-        for reader in self.readers:
-            for storage in getattr(reader.storage, "storages", [reader.storage]):
-                yield from storage.dbconn.execute(query, tuple(topics))
+        for storage in storages:
+            yield from storage.dbconn.execute(query, tuple(topics))
 
     def fetcher(self, topic: str, times: IntArray) -> Callable[[int], bytes]:
         """Return a function that reads the message of a row of a topic, fastest row after row."""
@@ -141,10 +132,9 @@ def bag_channels(path: Path, *, whole: bool = False) -> list[ExternalChannel]:
         stamps: dict[str, list[int]] = {name: [] for name in kinds}
         with limited(path, "rosbags"):
             if bag.ros1 and not whole:
-                for reader in bag.readers:
-                    for connection in reader.connections:
-                        entries = reader.indexes.get(connection.id, ())
-                        stamps[str(connection.topic)] += [entry.time for entry in entries]
+                for connection in bag.reader.connections:
+                    entries = bag.reader.indexes.get(connection.id, ())
+                    stamps[str(connection.topic)] += [entry.time for entry in entries]
             else:
                 messages = bag.messages if whole else bag.stamps
                 for name, stamp, *_ in messages(list(kinds)):
@@ -170,68 +160,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
     from rosbags.rosbag2 import Reader as Rosbag2
 
     ros1 = path.suffix == ".bag" and path.is_file()
-    with _parts(path) as parts, ExitStack() as opened:
-        with limited(path, "rosbags"):
-            readers: list[Any] = [Rosbag1(part) if ros1 else Rosbag2(part) for part in parts]
-            for reader in readers:
-                reader.open()
-                opened.callback(reader.close)
-        yield Bag(path, readers, ros1)
-
-
-@contextlib.contextmanager
-def _parts(path: Path) -> Iterator[Sequence[Path]]:
-    """Yield the paths for rosbags: the bag, or its packed files, unpacked to a temporary folder.
-
-    Files are unpacked here, because rosbags sets no limit. It unpacks chunks and messages in
-    memory, which has a budget.
-
-    Raises:
-        UsageError: a file of the bag is not a regular file.
-        LogDamagedError: the folder is not a bag, or its files unpack to more than the limit.
-    """
-    if not path.is_dir():
+    if path.is_dir():
+        check_regular(path / METADATA, MAX_METADATA)
+    else:
         check_regular(path)
-        yield [path]
-        return
-    from ruamel.yaml import YAML
-
-    with limited(path / METADATA, "YAML"):
-        text = read_regular(path / METADATA, MAX_METADATA).decode("utf-8")
-        info = YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
-        files = [path / PurePath(str(name)).name for name in info["relative_file_paths"]]
-        packed, storage = info.get("compression_mode"), str(info["storage_identifier"])
-    if storage != "sqlite3":
-        raise LogDamagedError(
-            f"{path}: storage {storage[:40]} is supported only as .mcap files: unpack them with "
-            "zstd -d"
-        )
-    for file in files:
-        check_regular(file)
-    if str(packed).lower() != "file":
-        yield [path]
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        yield [_unpacked(file, Path(folder)) for file in files]
-
-
-def _unpacked(packed: Path, folder: Path) -> Path:
-    """Unpack a file into a folder, unless it becomes far too large or leaves no room on the disk.
-
-    Raises:
-        LogDamagedError: the file exceeds the limit, or was not packed by zstd.
-    """
-    target = folder / packed.stem
-    with limited(packed, "zstd"), opened_regular(packed) as source, target.open("xb") as out:
-        most = max(os.fstat(source.fileno()).st_size * MOST_TIMES, MAX_CHUNK)
-        most = min(most, shutil.disk_usage(folder).free // 2)
-        unpacking = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2)
-        reader = unpacking.stream_reader(source, read_across_frames=True)
-        while part := reader.read(1 << 20):
-            out.write(part)
-            if out.tell() > most:
-                raise LogDamagedError(
-                    f"{packed} unpacks to more than the limit of {most} bytes: unpack it with "
-                    f"zstd -d, and remove compression_mode from {METADATA}"
-                )
-    return target
+    with limited(path, "rosbags"):
+        reader: Any = Rosbag1(path) if ros1 else Rosbag2(path)
+        reader.open()
+    with contextlib.closing(reader):
+        yield Bag(path, reader, ros1)
