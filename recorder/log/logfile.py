@@ -13,11 +13,9 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
-from weakref import WeakSet
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.files import partial_path, refuse_taken, to_disk
-from recorder.mcap.store import OPEN_FILES
 from recorder.mcap.writer import McapWriter
 
 # Default log time after which the present chunk is passed to the operating system. A shorter time
@@ -32,9 +30,7 @@ class AppendOnlyFile:
 
     The MCAP writer would continue after a failed write, and leave a hole in the log.
 
-    The first `OPEN_FILES` files that are written at the same time stay open, which locks them
-    against other processes; further files are opened for each write. A recorder of many files locks
-    their folder instead.
+    It is locked against other processes while it is open.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,11 +54,7 @@ class AppendOnlyFile:
             except BaseException:
                 file.close()
                 raise
-            if len(_STAY_OPEN) < OPEN_FILES:
-                self._file = file
-                _STAY_OPEN.add(self)
-            else:
-                file.close()
+            self._file = file
 
     def check(self) -> None:
         """Raise a LogWriteError if a write has failed, or the file is closed."""
@@ -95,7 +87,6 @@ class AppendOnlyFile:
     def close(self) -> None:
         """Close the file; ignore an error of it, which repeats that of an earlier write."""
         self.closed = True
-        _STAY_OPEN.discard(self)
         file, self._file = self._file, None
         if file is not None:
             with contextlib.suppress(LogWriteError), self._errors(), file:
@@ -105,12 +96,9 @@ class AppendOnlyFile:
     def _opened(self) -> Iterator[BinaryIO]:
         """Yield the open file; raise the error of an earlier write."""
         self.check()
+        assert self._file is not None
         with self._errors():
-            if self._file is not None:
-                yield self._file
-            else:
-                with open(os.open(self._path, os.O_WRONLY | os.O_APPEND), "ab") as file:
-                    yield file
+            yield self._file
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
@@ -135,9 +123,6 @@ class AppendOnlyFile:
             mine = True  # this file system has no locks
         if not mine:
             raise UsageError(f"{self._path} is being written by another process: wait for it")
-
-
-_STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()
 
 
 def write_error(path: Path, error: OSError) -> LogWriteError:

@@ -26,7 +26,7 @@ from recorder.mcap.records import (
     Segment,
     crc32,
 )
-from recorder.mcap.store import OnePass, Store
+from recorder.mcap.store import Store
 from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
@@ -55,9 +55,8 @@ class LogReader(LogStructure):
             log: path of a file, or its store, which is closed with the reader.
             skip_damaged: True to skip damaged parts.
             check: "chunks" trusts a summary that accounts for every message; "data" reads every
-                record, and the checksum over the data; "pass" leaves the checksum, and without
-                `skip_damaged` also the records, to `one_pass`. None: "chunks", or "data" with
-                `skip_damaged`.
+                record, and the checksum over the data; "pass" leaves the checksum to `one_pass`.
+                None: "chunks", or "data" with `skip_damaged`.
 
         Raises:
             UsageError: the file cannot be opened.
@@ -66,11 +65,10 @@ class LogReader(LogStructure):
         self._failed: set[int] = set()
         self._defined = self._searched = self._checked = False
         if not isinstance(log, Store):
-            log = OnePass(Path(log)) if check == "pass" else Store(Path(log))
+            log = Store(Path(log))
         check = check or ("data" if skip_damaged else "chunks")
         try:
-            by_index = check == "chunks" or (check == "pass" and not skip_damaged)
-            super().__init__(log, skip_damaged=skip_damaged, by_index=by_index)
+            super().__init__(log, skip_damaged=skip_damaged, by_index=check == "chunks")
             note = None if check == "chunks" else self.note
             self._chunks = Chunks(log, self.definitions, note, self._check_unproven)
             if self.torn is not None and self.torn in self.segments:
@@ -206,23 +204,17 @@ class LogReader(LogStructure):
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Yield every chunk in file order, with None for a damaged one that is skipped.
 
-        Open the log with check "pass" for this. Without `skip_damaged` each byte is read once, and
-        every record and the checksum over all data are checked.
+        Open the log with check "pass" for this, which leaves the checksum over all data to this
+        method.
 
         Raises:
             LogDamagedError: without `skip_damaged`, at the first damage.
         """
-        file = self.file
-        assert isinstance(file, OnePass)
-        if self.by_index:
-            for segment in self.walk():
-                yield segment, self.table(segment)
-        else:
-            file.start(file.size)
-            for segment in self.segments:
-                file.pass_to(segment.offset)
-                yield segment, self.table(segment)
-        self._check_data(file.crc_to(self.data_end))
+        crc = at = 0
+        for segment in self.segments:
+            yield segment, self.table(segment)
+            crc, at = self.file.crc(at, segment.stop, crc), segment.stop  # from the page cache
+        self._check_data(self.file.crc(at, self.data_end, crc))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Announce the chunks, or only their indexes, that will be read one after the other."""

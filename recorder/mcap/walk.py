@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import struct
 from bisect import bisect_left
-from collections.abc import Iterator
 from typing import Final
 
 from mcap.opcode import Opcode
@@ -33,7 +32,7 @@ from recorder.mcap.records import (
     no_log,
 )
 from recorder.mcap.resync import cut_chunk, inner_end, is_record, next_chunk
-from recorder.mcap.store import OnePass, Store
+from recorder.mcap.store import Store
 from recorder.mcap.summary import Summary, read_summary
 
 # Approximate size of the pieces in which messages outside chunks are decoded, that of a usual
@@ -126,25 +125,6 @@ class LogStructure:
         new = Problem(place, problem)
         self.problems += [new] if new not in self.problems else []
 
-    def walk(self) -> Iterator[Segment]:
-        """Walk over every record of a log that was opened by its index, in one pass.
-
-        Yields:
-            Each chunk in the index, before the walk continues after it.
-        """
-        assert self._limit is not None
-        assert isinstance(self.file, OnePass)
-        self.file.start(self._limit)
-        stated, self.segments, self._attachments = self.segments, [], []
-        self.metadata, self._metadata_bytes, self._attachment_ranges = [], 0, []
-        self.by_index, self.complete = False, False
-        self._at, self.data_crc = len(MAGIC), None
-        for segment in stated:
-            self._walk_data(segment.offset)
-            self.file.pass_to(segment.offset)
-            yield segment
-        self._walk_data()
-
     def _damaged(self, place: str, problem: str) -> None:
         if self.first_damage is None:
             self.first_damage = self._at
@@ -182,9 +162,9 @@ class LogStructure:
         self._at = start
         self._take(present, start + RECORD_HEADER.size, length)
 
-    def _walk_data(self, stop: int | None = None) -> None:
-        """Walk over the records up to an offset, or to the end of the data section."""
-        while self.data_crc is None and (stop is None or self._at < stop):
+    def _walk_data(self) -> None:
+        """Walk over the records up to the end of the data section."""
+        while self.data_crc is None:
             limit = self.file.size if self._limit is None else self._limit
             where = f"byte {self._at}"
             try:
@@ -195,8 +175,6 @@ class LogStructure:
                 if not self._resume_after():
                     self.missing = f"everything from byte {self._at} on is unreadable"
                     break
-        if stop is not None:
-            return
         self._close_loose()
         if self.data_crc is not None and self._limit is None and not self.missing:
             self.missing = "cut short: part of its summary is missing, but no message is"
