@@ -30,7 +30,7 @@ CEILINGS = {
     "recorder/world": 1410,
     "replay": 740,
     "replay/corpus": 755,
-    "replay/episodes": 1130,
+    "replay/episodes": 1190,
     "replay/export": 764,
     "replay/integrity": 1010,
     "replay/logs": 2790,

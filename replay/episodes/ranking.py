@@ -18,9 +18,10 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.processes import run_all
 from recorder.log.files import locked_folder, make_folder
-from replay.episodes.features import Lag, features_of, lag_column, unlike_columns
+from replay.episodes.features import features_of, unlike_columns
 from replay.episodes.groups import groups_of
 from replay.episodes.images import columns_of_images
+from replay.episodes.lag import Lag, lag_column
 from replay.episodes.measure import Measured, load_measures, save_measures
 from replay.episodes.numbers import Column, number_columns
 from replay.episodes.reading import EpisodeLog, list_episodes, measure_episode
@@ -45,6 +46,7 @@ class Ranked:
         columns: the measures that are compared, over all episodes.
         scores: (n, columns) distance over the limit, 1 or more gives the reason; NaN: not judged.
         score: (n,) largest score of each episode; from 1 on it is flagged.
+        lags: how late each camera is in each episode, by (episode, camera).
         notes: lines about the dataset as a whole.
         defects: reasons that need no comparison: unreadable, or a camera is missing.
     """
@@ -55,6 +57,7 @@ class Ranked:
     columns: list[Column] = field(default_factory=list)
     scores: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     score: FloatArray = field(default_factory=lambda: np.zeros(0))
+    lags: dict[tuple[int, str], Lag] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     defects: dict[int, list[str]] = field(default_factory=dict)
 
@@ -96,6 +99,8 @@ class Ranked:
             for column, score in zip(self.columns, self.scores[i], strict=True):
                 values = {"": column.value[i], "_score": score}
                 name = column_name(column)
+                if column.reason == "lag" and (lag := self.lags.get((i, column.camera))):
+                    values |= {"_error": lag.error, "_margin": lag.margin}
                 row |= {name + k: None if math.isnan(v) else float(v) for k, v in values.items()}
             rows.append(row)
         return rows
@@ -253,8 +258,11 @@ def _columns_of(ranked: Ranked, name: str, group: IntArray) -> Iterator[tuple[In
         for c in (*columns_of_images(episodes, camera), *unlike_columns(cameras, features)):
             yield having, c._replace(camera=camera)
         if late := lag_column(episodes, camera, features.slow):
-            yield having, late[0]._replace(camera=camera)
-            ranked.notes.append(_lag_note(late[1], name))
+            column, lags, whole = late
+            yield having, column._replace(camera=camera)
+            ranked.lags |= {(int(i), camera): lag for i, lag in zip(having, lags, strict=True)}
+            place = f"camera {camera}{f' of {name}' if name else ''}"
+            ranked.notes.append(f"{place}: {_lag_text(whole)}")
 
 
 def _find_swapped(ranked: Ranked, group: IntArray) -> None:
@@ -285,9 +293,11 @@ def _alike(ranked: Ranked, group: IntArray, sizes: Sequence[Any], what: str) -> 
     return group[[size == common for size in sizes]]
 
 
-def _lag_note(lag: Lag, group: str) -> str:
-    text = "its lag behind the joints cannot be measured"
-    if not math.isnan(lag.seconds):
-        side = "behind" if lag.seconds >= 0 else "ahead of"
-        text = f"{abs(lag.seconds) * 1e3:.0f} ms {side} the joints, +- {lag.error * 1e3:.0f} ms"
-    return f"camera {lag.camera}{f' of {group}' if group else ''}: {text}"
+def _lag_text(lag: Lag) -> str:
+    if not lag.certain:
+        return "its lag behind the joints cannot be measured: too little moves that both show"
+    side = "behind" if lag.seconds >= 0 else "ahead of"
+    return (
+        f"{abs(lag.seconds) * 1e3:.0f} ms {side} the joints, +- {lag.error * 1e3:.0f} ms, "
+        f"{lag.margin:.2f} above the second peak"
+    )

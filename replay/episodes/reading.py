@@ -172,10 +172,13 @@ def read_numbers(log: EpisodeLog, opened: ExitStack) -> dict[str, Rows]:
         for kind, name in (("state", "observation.state"), ("action", "action")):
             topics[kind] += [name] if name in known else []
     elif format in _WITH_TOPICS:
-        for channel in describe_log(path, decode=False).channels:
+        files = sorted(path.glob("*.mcap")) if format == "split" else [path]
+        reports = [describe_log(file, decode=False) for file in files]
+        for channel in (channel for report in reports for channel in report.channels):
+            command = any(word in channel.topic.lower() for word in COMMANDS)
+            names = topics["action" if command else "state"]
             if channel.schema.endswith("JointState") and channel.messages:
-                command = any(word in channel.topic.lower() for word in COMMANDS)
-                topics["action" if command else "state"].append(channel.topic)
+                names += [channel.topic] if channel.topic not in names else []
     numbers: dict[str, Rows] = {}
     for kind in ("state", "action"):
         if words := log.topics.get(kind) or topics[kind]:
