@@ -25,9 +25,7 @@ def test_the_bytes_are_those_of_the_mcap_package(seed, monkeypatch):
         enable_data_crcs=True,
     )
     theirs.start(profile="p", library="l")
-    ours = McapWriter(
-        two, library="l", profile="p", compression=compression, chunk_size=size, aside=seed % 2 == 1
-    )
+    ours = McapWriter(two, library="l", profile="p", compression=compression, chunk_size=size)
     channels: list[int] = []
     for step in range(rng.randrange(80)):
         what, data = rng.random(), rng.randbytes(rng.randrange(300))

@@ -50,8 +50,6 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         np.testing.assert_allclose(10**powers, [np.ravel(s.eta_dot)[0] for s in signals])
     with pytest.raises(UsageError, match="--force"):
         build_overlay(runs, side_by_side(runs), out)
-    with pytest.raises(UsageError, match="no tab 'nowhere'"):
-        build_overlay(runs, side_by_side(runs), out, force=True, tab="nowhere")
 
 
 def test_the_command_exits_with_4_if_runs_differ(three, tmp_path, cdmisfa):

@@ -214,7 +214,6 @@ class LogFile(McapWriter):
         self._stream.check()
         self._chunk_start = None
         self.end_chunk()
-        self.settle()
         self._stream.flush()
 
     def sync(self) -> None:

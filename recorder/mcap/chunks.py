@@ -39,8 +39,6 @@ from recorder.mcap.store import Store
 
 # Message indexes of a chunk: channel, and (n, 2) log time (ns) and offset of each message.
 Pairs = list[tuple[int, NDArray[np.uint64]]]
-# Mean bytes of a chunk for each message below which the chunk is copied to slice its payloads.
-_SMALL: Final = 2048
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +89,7 @@ class MessageTable:
         names = "channel", "sequence", "log_time", "publish_time"
         columns = [self.records[name].tolist() for name in names]
         spans = map(slice, self.at.tolist(), (self.at + self.size).tolist())
-        if len(self.data) < _SMALL * len(self):
-            payloads = map(self.data.tobytes().__getitem__, spans)
-        else:
-            payloads = map(bytes, map(self.data.data.__getitem__, spans))
+        payloads = map(bytes, map(self.data.data.__getitem__, spans))
         return zip(*columns, payloads, strict=True)
 
     def payload(self, row: int) -> bytes:

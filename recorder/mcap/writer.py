@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Final
 
@@ -45,7 +44,6 @@ class McapWriter:
         profile: profile of the messages, for the header.
         compression: compression of the chunks.
         chunk_size: size of the records at which a chunk ends (bytes).
-        aside: True to compress and append chunks in another thread; the bytes are the same.
     """
 
     def __init__(
@@ -56,7 +54,6 @@ class McapWriter:
         profile: str = "",
         compression: Compression = "zstd",
         chunk_size: int = 1024 * 1024,
-        aside: bool = False,
     ) -> None:
         self._out = out
         self._chunk_size = chunk_size
@@ -67,12 +64,8 @@ class McapWriter:
         self._attachments: list[mcap.AttachmentIndex] = []
         self._metadata: list[mcap.MetadataIndex] = []
         self._counts: dict[int, int] = {}
-        # Two buffers that only grow, because memory that is used again is in the processor's cache.
-        # One receives the next chunk while the other is compressed.
+        # A buffer that only grows, because memory that is used again is in the processor's cache.
         self._records = memoryview(bytearray())
-        self._other_buffer = memoryview(bytearray()) if aside else self._records
-        self._aside = ThreadPoolExecutor(1) if aside else None
-        self._pending: Future[None] | None = None
         self._size = 0
         self._index: dict[int, list[int]] = {}
         self._crc = 0
@@ -82,7 +75,6 @@ class McapWriter:
     @property
     def size(self) -> int:
         """Number of bytes written, without the present chunk."""
-        self.settle()
         return int(self._out.tell())
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -133,7 +125,6 @@ class McapWriter:
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record immediately, outside of the chunks."""
-        self.settle()
         data = _encoded(mcap.Metadata(name=name, metadata=dict(values)))
         self._metadata.append(mcap.MetadataIndex(self._out.tell(), len(data), name))
         self._append(data)
@@ -143,7 +134,6 @@ class McapWriter:
         self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
     ) -> None:
         """Write an attachment immediately, outside of the chunks; times in ns."""
-        self.settle()
         stored = _encoded(mcap.Attachment(create_time, log_time, name, media_type, data))
         place, times = (self._out.tell(), len(stored)), (log_time, create_time)
         self._attachments.append(mcap.AttachmentIndex(*place, *times, len(data), name, media_type))
@@ -151,28 +141,15 @@ class McapWriter:
         self._out.flush()
 
     def end_chunk(self) -> None:
-        """End the present chunk if it has a message; another thread may append it later."""
-        if not self._index:
-            return
-        self.settle()
-        work = partial(self._append_chunk, self._records, self._size, self._index)
-        self._records, self._other_buffer = self._other_buffer, self._records
-        self._size, self._index = 0, {}
-        if self._aside is None:
-            work()
-        else:
-            self._pending = self._aside.submit(work)
-
-    def settle(self) -> None:
-        """Wait until all ended chunks are appended; raise the error of one that failed."""
-        if self._pending is not None:
-            self._pending.result()
-            self._pending = None
+        """End the present chunk if it has a message, and append it."""
+        if self._index:
+            size, index = self._size, self._index
+            self._size, self._index = 0, {}
+            self._append_chunk(size, index)
 
     def end(self) -> None:
         """End the present chunk, and append the summary."""
         self.end_chunk()
-        self.settle()
         self._append(_encoded(mcap.DataEnd(self._crc)))
         start = at = self._out.tell()
         statistics = mcap.Statistics(
@@ -204,17 +181,16 @@ class McapWriter:
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, at), crc32(summary))
         self._append(summary + _encoded(mcap.Footer(start, at, crc)) + MAGIC)
 
-    def _append_chunk(self, buffer: memoryview, size: int, index: dict[int, list[int]]) -> None:
+    def _append_chunk(self, size: int, index: dict[int, list[int]]) -> None:
         """Append a chunk with its message indexes.
 
         Args:
-            buffer: the buffer, which begins with the records.
-            size: size of the records (bytes).
+            size: size of the records at the beginning of the buffer (bytes).
             index: for each channel, log time and offset of each message, alternating.
         """
         times = [pairs[::2] for pairs in index.values()]
         first, last = min(map(min, times)), max(map(max, times))
-        with buffer[:size] as records:
+        with self._records[:size] as records:
             stored, crc = self._compress(records), crc32(records)
         head = chunk_head(first, last, size, crc, self._compression, len(stored))
         chunk = len(head) + len(stored)
@@ -259,8 +235,6 @@ class McapWriter:
         grown = memoryview(bytearray(max(size, 2 * self._size)))
         grown[: self._size] = self._records[: self._size]
         self._records = grown
-        if self._aside is None:
-            self._other_buffer = grown
 
     def _append(self, data: bytes | memoryview) -> None:
         self._crc = crc32(data, self._crc)

@@ -177,7 +177,7 @@ def _log_sink(out: Path, spec: SourceSpec, modules: Sequence[Module]) -> Iterato
         ImageEncoder(shape[0], shape[1], name) if len(shape) > 1 else VectorEncoder()
         for shape, name in zip(shapes, spec.streams, strict=True)
     ]
-    log = LogFile(out, force=True, compression="lz4", aside=True)
+    log = LogFile(out, force=True, compression="lz4")
 
     def channel(topic: str, schema: str, definition: bytes) -> int:
         return log.add_channel(topic, log.add_schema(schema, ENCODING, definition))

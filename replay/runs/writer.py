@@ -68,7 +68,6 @@ class RunWriter(Sink):
             compression="lz4",
             chunk_size=CHUNK_BYTES,
             flush_ns=NEVER_NS,
-            aside=True,
         )
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(

@@ -38,7 +38,6 @@ def build_overlay(
     out: Path,
     *,
     force: bool = False,
-    tab: str | None = None,
 ) -> None:
     """Write the curves of several runs, one color a run, into one .rrd file.
 
@@ -49,10 +48,9 @@ def build_overlay(
         compared: their rows by `side_by_side`.
         out: the file.
         force: replace an existing file.
-        tab: name of the tab that is open; by default the first.
 
     Raises:
-        UsageError: `out` exists and `force` is not set, or there is no such tab.
+        UsageError: `out` exists and `force` is not set.
         LogDamagedError: a run cannot be read.
         CdmisfaError: the file cannot be written.
     """
@@ -69,7 +67,7 @@ def build_overlay(
                 _write_curves(writer, root, signals, selected, number, row.name)
             writer.flush()
             written |= writer.spans.keys()
-        recording.send_blueprint(_layout(compared, roots, written, tab))
+        recording.send_blueprint(_layout(compared, roots, written))
 
 
 def _write_curves(
@@ -97,7 +95,7 @@ def _write_curves(
 
 
 def _layout(
-    compared: Sequence[ComparedRun], roots: Sequence[str], written: Collection[str], tab: str | None
+    compared: Sequence[ComparedRun], roots: Sequence[str], written: Collection[str]
 ) -> rrb.Blueprint:
     """Return a panel for each curve and each stream's error that a run has."""
     outline, length = compared[0].outline, max(row.outline.iterations for row in compared)
@@ -116,4 +114,4 @@ def _layout(
     errors = {f"{ERROR}/{part(names, s)}": f"Learning error of {drawable(names[s])}" for s in shown}
     if views := panels(errors):
         tabs.append(rrb.Vertical(*views, name="Streams"))
-    return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)
+    return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length)
