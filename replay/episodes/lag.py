@@ -18,6 +18,9 @@ SPAN: Final = 0.75
 # these themselves, so that a lag is found more exactly.
 STEP: Final = 0.2
 
+# Largest number of images that are compared with states: their memory is 3 kB each.
+MOST_IMAGES: Final = 30_000
+
 # Weight of the penalty of ridge regression, in images.
 RIDGE: Final = 10.0
 
@@ -75,9 +78,10 @@ def lag_column(
     clocks = [episode.cameras[camera].times for episode in episodes]
     frame = float(np.median([period(times) for times in clocks])) or 1.0
     span, step = max(int(SPAN / frame), 1), max(round(STEP / frame), 1)
+    thin = -(-sum(map(len, clocks)) // MOST_IMAGES)
     late = np.arange(-span, span + 1, dtype=np.float64) * frame
     changes = [
-        _changes(times, rows, clock, x, late, step)
+        _changes(times, rows, clock, x, late, step, thin)
         for times, rows, (clock, x) in zip(clocks, features, numbers, strict=True)
     ]
     if sum(len(f) for f, _ in changes) <= 4 * span:
@@ -102,18 +106,27 @@ def lag_column(
 
 
 def _changes(
-    times: FloatArray, f: FloatArray, clock: FloatArray, x: FloatArray, late: FloatArray, step: int
+    times: FloatArray,
+    f: FloatArray,
+    clock: FloatArray,
+    x: FloatArray,
+    late: FloatArray,
+    step: int,
+    thin: int,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the changes of features, (T, 16), and of states at each lag, (T, lags, n).
 
     Images near the begin and the end, of which a state at some lag is unknown, are left out.
     """
-    shifted = times - late[:, None]
-    inside = (shifted[-1] >= clock[0]) & (shifted[0] <= clock[-1])
-    shifted, f = shifted[:, inside], f[inside]
-    states = np.stack([np.interp(shifted, clock, column) for column in x.T], axis=-1)
-    changes = (states[:, step:] - states[:, :-step]).transpose(1, 0, 2)
-    return f[step:] - f[:-step], changes
+    begin = np.arange(0, len(times) - step, thin)
+    inside = times[begin] - late[-1] >= clock[0]
+    inside &= times[begin + step] - late[0] <= clock[-1]
+    begin = begin[inside]
+    after, before = (
+        np.stack([np.interp(times[rows][:, None] - late, clock, column) for column in x.T], axis=-1)
+        for rows in (begin + step, begin)
+    )
+    return f[begin + step] - f[begin], after - before
 
 
 def _ridge(gram: FloatArray, product: FloatArray) -> FloatArray:
@@ -121,7 +134,7 @@ def _ridge(gram: FloatArray, product: FloatArray) -> FloatArray:
 
 
 def _predicted(changes: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Return sums (parts, lags, 3) of products of states with what images of other parts tell.
+    """Return sums (parts, lags, 3) of products of states and estimates from images of other parts.
 
     The three are estimate x state, estimate x estimate, and state x state, over joints.
     """
