@@ -116,7 +116,7 @@ def _changes(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the changes of features, (T, 16), and of states at each lag, (T, lags, n).
 
-    Images near the begin and the end, of which a state at some lag is unknown, are left out.
+    Images without a state at some lag, near the begin and the end, are left out.
     """
     begin = np.arange(0, len(times) - step, thin)
     inside = times[begin] - late[-1] >= clock[0]

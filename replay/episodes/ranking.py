@@ -145,7 +145,7 @@ def rank_episodes(
         words: LeRobot datasets, folders, patterns and files.
         out: folder of the results; it keeps the measures.
         by: column of the dataset whose values are groups; None: tasks, and views as detected.
-        topics: topics or features of "state" and "action"; those that lack are found by themselves.
+        topics: topics or features of "state" and "action"; others are found by type and name.
         jobs: number of processes; the result does not depend on it.
         progress: called with the number of episodes that are measured, and of all.
         stop: called after each episode; true ends the work.

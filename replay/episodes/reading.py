@@ -60,8 +60,8 @@ class EpisodeLog:
         first: its first frame in a LeRobot dataset.
         count: its frames in a LeRobot dataset.
         problem: why it cannot be opened, or "".
-        topics: topics or features of "state" and of "action", as TOPIC or TOPIC:FIELD; empty for
-            those that are found by type and name.
+        topics: topics or features of "state" and of "action", as TOPIC or TOPIC:FIELD; others
+            are found by type and name.
     """
 
     name: str
