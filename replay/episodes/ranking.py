@@ -197,6 +197,7 @@ def _measured(task: tuple[EpisodeLog, Path]) -> Measured:
 def compare(logs: list[EpisodeLog], measured: list[Measured], by: str | None = None) -> Ranked:
     """Compare measured episodes within their groups."""
     ranked = Ranked(logs, measured)
+    ranked.notes += dict.fromkeys(log.missing for log in logs if log.missing)
     readable = np.array([i for i, one in enumerate(measured) if not one.problem])
     groups = groups_of([logs[i] for i in readable], [measured[i] for i in readable], by)
     ranked.groups = {name: readable[part] for name, part in groups.items()}

@@ -62,6 +62,7 @@ class EpisodeLog:
         problem: why it cannot be opened, or "".
         topics: topics or features of "state" and of "action", as TOPIC or TOPIC:FIELD; others
             are found by type and name.
+        missing: why further episodes of its dataset are not read, or "".
     """
 
     name: str
@@ -73,6 +74,7 @@ class EpisodeLog:
     count: int = 0
     problem: str = ""
     topics: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    missing: str = ""
 
     def key(self) -> str:
         """Return a name for measures of this episode, which differs if the log changes."""
@@ -136,12 +138,14 @@ def _is_whole(folder: str) -> bool:
 def _of_dataset(log: EpisodeLog, prefix: str) -> Iterator[EpisodeLog]:
     """Yield the episodes of a LeRobot dataset."""
     first = 0
-    for row in lerobot.episode_facts(location(log.files[0])):
+    rows, missing = lerobot.episode_facts(location(log.files[0]))
+    left = f"{log.files[0]}: {missing}" if missing else ""
+    for row in rows:
         length, number = int(row.pop("length")), int(row.pop("episode_index"))
         row["task"] = "; ".join(map(str, row.pop("tasks", None) or []))
         about = {k: str(v) for k, v in row.items() if isinstance(v, str | int) and v != ""}
         name, place = f"{prefix}episode {number}", (number, first, length)
-        yield EpisodeLog(name, log.files, log.state, about, *place, topics=log.topics)
+        yield EpisodeLog(name, log.files, log.state, about, *place, topics=log.topics, missing=left)
         first += length
 
 

@@ -23,6 +23,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
 from replay.export.frames import pieces, pixel_format, shared_spans, write_video
+from replay.logs.formats.lerobot_layout import Stats, table_of_tasks, write_stats
 from replay.logs.source import LoggedSource
 from replay.stored_source import Span
 
@@ -38,8 +39,6 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 # Values (n,) or (n, k) of each feature, and the names of its k numbers.
 Columns = dict[str, tuple[NDArray[Any], list[str] | None]]
-
-Stats = dict[str, NDArray[Any]]
 
 
 def write_dataset(
@@ -237,14 +236,7 @@ def _write_meta(
             row |= {f"stats/{key}/{name}": value.tolist() for name, value in values.items()}
         row |= _file_number("meta/episodes", 0)
     pq.write_table(pa.Table.from_pylist(episodes), _path(meta / "episodes", 0, "parquet"))
-    # The table of tasks is as pandas writes it: the text is the index of the row.
-    index = "__index_level_0__"
-    kind = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-    columns = [{"name": None, "field_name": index, **kind}]
-    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
-    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), index: pa.array(tasks)})
-    table = table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-    pq.write_table(table, meta / "tasks.parquet")
+    pq.write_table(table_of_tasks(tasks), meta / "tasks.parquet")
     videos = any(feature["dtype"] == "video" for feature in features.values())
     info = {
         "codebase_version": "v3.0",
@@ -262,9 +254,7 @@ def _write_meta(
         "features": features,
     }
     (meta / "info.json").write_text(json.dumps(info, indent=4), "utf-8")
-    whole = {key: aggregated([episode[key] for episode in stats]) for key in features}
-    lists = {key: {n: v.tolist() for n, v in values.items()} for key, values in whole.items()}
-    (meta / "stats.json").write_text(json.dumps(lists, indent=4), "utf-8")
+    write_stats(meta / "stats.json", {key: [part[key] for part in stats] for key in features})
 
 
 def number_stats(values: NDArray[Any]) -> Stats:
@@ -296,24 +286,3 @@ def image_stats(source: LoggedSource, stream: int, span: Span) -> Stats:
     }
     stats = {key: np.full((3, 1, 1), value) for key, value in values.items()}
     return {**stats, "count": np.array([span[1] - span[0]])}
-
-
-def aggregated(parts: Sequence[Stats]) -> Stats:
-    """Return statistics over all parts from those of each part; quantiles are averaged.
-
-    LeRobot averages quantiles in the same way.
-    """
-    counts = np.array([float(part["count"][0]) for part in parts])
-
-    def mean(values: list[NDArray[Any]]) -> NDArray[Any]:
-        return np.average(values, axis=0, weights=counts)
-
-    centre = mean([part["mean"] for part in parts])
-    return {
-        "min": np.min([part["min"] for part in parts], axis=0),
-        "max": np.max([part["max"] for part in parts], axis=0),
-        "mean": centre,
-        "std": np.sqrt(mean([part["std"] ** 2 + (part["mean"] - centre) ** 2 for part in parts])),
-        "count": np.array([int(counts.sum())]),
-        **{key: mean([part[key] for part in parts]) for key in QUANTILES},
-    }

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.log.files import make_folder, refuse_unless
+from recorder.log.files import make_folder, refuse_existing, refuse_unless
 from recorder.log.logfile import LogFile
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.chunks import UNUSED, MessageTable, chunk_records, walked_table
@@ -24,7 +24,9 @@ from recorder.mcap.records import CHUNK_HEADER, MalformedRecord, Problem, Segmen
 from recorder.mcap.store import PARTIAL, Store
 from replay.integrity.info import ChannelCount, problems_of
 from replay.integrity.report import SCHEMA
-from replay.logs.open_logs import is_external_format
+from replay.integrity.whole_dataset import write_whole
+from replay.logs.formats.lerobot import dataset_channels
+from replay.logs.open_logs import is_external_format, log_format
 from replay.runs.folders import FINAL_METADATA
 from replay.storage.location import location
 from replay.storage.paths import log_files
@@ -76,19 +78,22 @@ class Recovery:
 def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Recovery:
     """Write a complete, indexed log of everything in `src` that is readable.
 
-    Each log of a folder is recovered into the folder `dst`.
+    Of a LeRobot dataset the whole episodes are written. Each log of a folder is recovered into the
+    folder `dst`.
 
     Raises:
-        UsageError: no such log, one of another kind than MCAP, or the output exists and `force` is
+        UsageError: no such log, one of another kind, or the output exists and `force` is
             not set.
         LogDamagedError: not an MCAP file, or nothing in it can be saved.
         LogWriteError: the disk does not take it.
     """
     src, dst = location(src), Path(dst)
     if src.exists() and is_external_format(src):
+        if log_format(src) == "dataset":
+            return _recover_dataset(src, dst, force)
         raise UsageError(
-            f"{src} is not an MCAP file, and only these can be recovered: skip broken images with "
-            "--skip-damaged of learn and convert"
+            f"{src} is not an MCAP file or LeRobot dataset, and only these can be recovered: skip "
+            "broken images with --skip-damaged of learn and convert"
         )
     files, alone = log_files(src), not src.is_dir()
     if alone:
@@ -107,6 +112,29 @@ def recover_log(src: str | Path, dst: str | Path, *, force: bool = False) -> Rec
         lost=tuple(p for result in results for p in result.lost),
         mended=tuple(p for result in results for p in result.mended),
         unverified=sum(result.unverified for result in results),
+    )
+
+
+def _recover_dataset(src: Path, dst: Path, force: bool) -> Recovery:
+    """Write the whole episodes of a LeRobot dataset; a channel is a feature."""
+    refuse_existing(dst, force=force, resumable=False)
+    places = src.resolve(), dst.resolve()
+    if places[0].is_relative_to(places[1]) or places[1].is_relative_to(places[0]):
+        raise UsageError(f"{dst}: it holds the input, or lies in it; choose another output")
+    channels = [channel.info for channel in dataset_channels(src)]
+    dataset, lost = write_whole(src, dst)
+    stated, count = int(dataset.info["total_frames"]), len(dataset.times)
+    unread = max(stated - count, 0) if stated > count or not lost else None
+    problems = (Problem(str(src), dataset.missing),) if dataset.missing else ()
+    return Recovery(
+        str(dst),
+        tuple(
+            ChannelRecovery(c.topic, count, unread, c.start_ns, c.end_ns, dst.name)
+            for c in channels
+        ),
+        problems if lost else (),
+        () if lost else problems,
+        0,
     )
 
 

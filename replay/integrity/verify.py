@@ -316,17 +316,18 @@ def _check_external(path: Path) -> LogReport:
         channels = channels_of(path, whole=True)
     except LogDamagedError as error:
         return replace(failed(path, error), crc="absent")
-    report = _check_topics(path, [c.info.topic for c in channels if c.images and c.info.messages])
+    topics = [c.info.topic for c in channels if c.images and c.info.messages]
+    report = _check_topics(path, topics, [c.missing for c in channels if c.missing])
     if kind == "images" and channels[0].info.encoding == "png":  # PNG has checksums of its own
         report = replace(report, crc="ok" if report.ok else "bad")
     notes = dict.fromkeys(line for channel in channels for line in channel.remarks)
     return replace(report, notes=tuple(notes | dict.fromkeys(report.notes)))
 
 
-def _check_topics(path: Path, topics: Iterable[str]) -> LogReport:
-    """Decode every image on some topics of a camera log."""
+def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ()) -> LogReport:
+    """Decode every image on some topics of a camera log; `absent` parts are reported with it."""
     problems: list[Problem] = []
-    missing: dict[str, None] = {}
+    missing = dict.fromkeys(absent)
     notes: dict[str, None] = {}
     for topic in topics:
         try:

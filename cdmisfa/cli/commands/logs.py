@@ -204,21 +204,24 @@ def verify_command(path: tuple[str, ...], as_json: bool) -> int:
 
 @options.command("recover")
 @click.argument("path", type=options.WORD)
-@options.output("New MCAP file to write.", required=True)
+@options.output("New MCAP file or dataset to write.", required=True)
 @options.force
 @options.as_json
 def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
-    """Repair a damaged MCAP file into a new file.
+    """Repair a damaged MCAP file, or LeRobot dataset, into a new one.
 
-    The command copies every message that can be read, and prints how many are lost. The damaged
-    file does not change. The exit code is 3 if something is lost.
+    The command copies every message that can be read, and prints how many are lost. Of a LeRobot
+    dataset whose recording was killed it copies the whole episodes, and writes tables, counts and
+    statistics that match. The damaged log does not change. The exit code is 3 if something is lost.
 
     PATH is one of:
         left.mcap             an MCAP file, such as one of a recording, or run.mcap
         s3://lab/left.mcap    an MCAP file at an s3://, http:// or https:// address
+        datasets/pick         a LeRobot dataset
 
     Examples:
         cdmisfa recover left.mcap -o left-repaired.mcap
+        cdmisfa recover datasets/pick -o datasets/pick-whole
         cdmisfa recover runs/kitchen/run.mcap -o repaired/run.mcap
         cdmisfa recover https://example.org/left.mcap -o left.mcap --json
     """
@@ -236,7 +239,7 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
             printing.table(("lost", "what"), [(p.where, p.what) for p in recovery.lost])
         for mended in recovery.mended:
             printing.status(f"{mended.where}: {mended.what}")
-        printing.line(f"repaired file written to {output}")
+        printing.line(f"repaired {'dataset' if output.is_dir() else 'file'} written to {output}")
     return 0 if recovery.complete else LogDamagedError.exit_code
 
 

@@ -22,6 +22,7 @@ from recorder.images.compressed import compressed_image
 from recorder.images.fields import column_names
 from recorder.images.options import RECIPE, VIDEO_RECIPE, InputOptions
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
+from replay.logs.formats import lerobot_layout as layout
 from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic, left_out
 from replay.logs.formats.table import number_stream
 from replay.logs.formats.video import VideoFile
@@ -34,7 +35,7 @@ INFO: Final = "meta/info.json"
 LAYOUT: Final = "LeRobot's layout"
 
 # Table of episodes of layout v2.1.
-_V21: Final = "meta/episodes.jsonl"
+V21: Final = "meta/episodes.jsonl"
 
 _IMAGES: Final = ("video", "image")
 
@@ -47,14 +48,15 @@ class Dataset:
 
     Attributes:
         info: description in meta/info.json.
-        rows: rows of the tables of episodes.
+        rows: rows of the tables of episodes, up to the last whole one.
+        missing: why further episodes are not read, or "".
         starts: the first frame of each episode, and the end of the last.
         times: time of each frame in nanoseconds.
     """
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self.path, self.info = path, _info(path)
-        self.rows = _episodes(path, ["episode_index", "length", *columns])
+        self.rows, self.missing = _episodes(path, ["episode_index", "length", *columns])
         with limited(path, LAYOUT):
             lengths = np.array([int(row["length"]) for row in self.rows], np.int64)
             self.starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -63,10 +65,10 @@ class Dataset:
         self.times = times.astype(np.int64)
 
     def notes(self, what: str) -> list[str]:
-        """Return the warning that episodes are joined, if there are several."""
+        """Return the warnings that episodes are joined, or not whole."""
         many = len(self.rows)
         note = f"{self.path}: {what} has {many} episodes, with gaps between them"
-        return [note] if many > 1 else []
+        return [note] * (many > 1) + ([f"{self.path}: {self.missing}"] if self.missing else [])
 
 
 def streams(
@@ -109,6 +111,7 @@ def streams(
             program=LAYOUT,
             recipe=VIDEO_RECIPE if camera.video else RECIPE,
             warnings=camera.dataset.notes(topic),
+            missing=camera.dataset.missing,
         )
         opened_streams.append(stream)
     read = [(feature,) for feature in (*chosen, *fields, *topics, *_CLOCK)]
@@ -122,15 +125,13 @@ class _Camera:
     def __init__(self, path: Path, topic: str, *, color: bool) -> None:
         self._topic, self._color = topic, color
         self.video = _info(path)["features"][topic]["dtype"] == "video"
-        place = f"videos/{topic}/" if self.video else "data/"
-        keys = [f"{place}chunk_index", f"{place}file_index"]
-        start = f"{place}from_timestamp" if self.video else "dataset_from_index"
-        self.dataset = Dataset(path, [*keys, start])
+        start = f"videos/{topic}/from_timestamp" if self.video else "dataset_from_index"
+        self.dataset = Dataset(path, [start])
         self._fps = float(self.dataset.info["fps"])
         scale = self._fps if self.video else 1
         with explained(path, LAYOUT):
-            rows = self.dataset.rows
-            self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
+            rows, key = self.dataset.rows, topic if self.video else ""
+            self._files = [layout.episode_file(self.dataset.info, row, key) for row in rows]
             self._first = [round(float(row[start]) * scale) for row in rows]
         self._file: Path | None = None
         self._images: Any = None
@@ -140,10 +141,7 @@ class _Camera:
         dataset = self.dataset
         episode = int(np.searchsorted(dataset.starts, row, side="right")) - 1
         place = self._first[episode] + row - int(dataset.starts[episode])
-        chunk, number = self._files[episode]
-        template = dataset.info["video_path" if self.video else "data_path"]
-        v21 = {"episode_chunk": chunk, "episode_index": number}
-        name = template.format(video_key=self._topic, chunk_index=chunk, file_index=number, **v21)
+        name = self._files[episode]
         file = dataset.path / name
         if self._file != file:
             self.close()
@@ -201,21 +199,30 @@ def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptio
     if absent := [name for name in names if name not in known]:
         raise UsageError(f"{path}: no field {absent[0]}; choose from {', '.join(known)}")
     dataset = Dataset(path, ["dataset_from_index"])
-    files = sorted((path / "data").rglob("*.parquet"))
-    if not files:
-        raise LogDamagedError(f"{path}: the tables of frames (data/*.parquet) are missing")
-    numbers = np.concatenate([_columns(file, names) for file in files])
-    with limited(path, LAYOUT, memory_bytes=numbers.nbytes):
-        starts = dataset.starts
-        firsts = np.array([int(row["dataset_from_index"]) for row in dataset.rows]) - starts[:-1]
-        frames = numbers[np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))]
+    frames = frame_numbers(dataset, names)
     stream = number_stream(
         path, topic, {what: frames}, dataset.times, options, lambda row: f"{path}: frame {row}"
     )
     widths = {name: math.prod(dataset.info["features"][name].get("shape", ())) for name in names}
     columns = [column for name in names for column in column_names(name, widths[name])]
     warnings = [*stream.warnings, *dataset.notes(what)]
-    return replace(stream, fields=names, columns=lambda: columns, warnings=warnings)
+    missing = dataset.missing
+    return replace(
+        stream, fields=names, columns=lambda: columns, warnings=warnings, missing=missing
+    )
+
+
+def frame_numbers(dataset: Dataset, names: Sequence[str]) -> FloatArray:
+    """Return numbers of each frame of a dataset that has `dataset_from_index`, (frames, n)."""
+    path = dataset.path
+    files = sorted({path / layout.episode_file(dataset.info, row) for row in dataset.rows})
+    if absent := [str(file) for file in files if not file.is_file()]:
+        raise LogDamagedError(f"{absent[0]}: this file of the dataset is missing")
+    numbers = np.concatenate([_columns(file, names) for file in files])
+    with limited(path, LAYOUT, memory_bytes=numbers.nbytes):
+        starts = dataset.starts
+        firsts = np.array([int(row["dataset_from_index"]) for row in dataset.rows]) - starts[:-1]
+        return np.asarray(numbers[np.arange(starts[-1]) + np.repeat(firsts, np.diff(starts))])
 
 
 def is_dataset(path: Path) -> bool:
@@ -225,12 +232,13 @@ def is_dataset(path: Path) -> bool:
 
 def dataset_channels(path: Path) -> list[ExternalChannel]:
     """Return the features of a dataset, one value a frame."""
-    info, channels = _info(path), []
-    last = max(int(info["total_frames"]) - 1, 0) * NANOSECONDS / float(info["fps"])
+    dataset, channels = Dataset(path, ()), []
+    info, count = dataset.info, len(dataset.times)
+    last = round(max(count - 1, 0) * NANOSECONDS / float(info["fps"]))
     for name, feature in info["features"].items():
         kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
-        channel = ChannelInfo(name, str(kind), shape, int(info["total_frames"]), 0, round(last))
-        channels.append(ExternalChannel(channel, images=kind in _IMAGES))
+        channel = ChannelInfo(name, str(kind), shape, count, 0, last)
+        channels.append(ExternalChannel(channel, kind in _IMAGES, dataset.missing))
     return channels
 
 
@@ -274,55 +282,70 @@ def _info(path: Path) -> Any:
         return info
 
 
-def episode_facts(path: Path) -> list[dict[str, Any]]:
-    """Return the facts about each episode besides its files, such as `tasks`."""
+def episode_facts(path: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return the facts about each whole episode besides its files, and a message about the rest."""
+    rows, missing = _episodes(path, ())
+    names = dict.fromkeys(name for row in rows for name in row)
+    facts = [n for n in names if "/" not in n and not n.startswith("dataset_")]
+    return [{name: row.get(name) for name in facts} for row in rows], missing
+
+
+def _episodes(path: Path, columns: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
+    """Return the rows of the tables of episodes, in their order, and a message about the rest.
+
+    Without `columns` they have every fact about the episodes.
+    """
     import pyarrow.parquet as pq
 
-    if (path / _V21).is_file():
-        names = list(dict.fromkeys(name for row in _v21_episodes(path) for name in row))
+    info, damage = _info(path), list[str]()
+    rows: list[dict[str, Any]] = []
+    if (path / V21).is_file():
+        rows = _v21_episodes(path, info, damage)
+    elif not (files := tables(path, "meta/episodes")):
+        damage.append("the tables of episodes (meta/episodes/*.parquet) are missing")
     else:
-        files = sorted((path / "meta" / "episodes").rglob("*.parquet"))[:1]
-        with limited(path, "PyArrow"):
-            names = [name for file in files for name in pq.read_schema(file).names]
-    facts = [n for n in names if "/" not in n and not n.startswith("dataset_")]
-    columns = dict.fromkeys(["episode_index", "length", *facts])
-    return [{name: row.get(name) for name in columns} for row in _episodes(path, [*columns])]
+        for file in files:
+            if layout.table_rows(file) is None:
+                damage.append(f"{file.relative_to(path)} {layout.NO_FOOTER}")
+                break
+            with limited(file, "PyArrow"):
+                parquet = pq.ParquetFile(file)
+                names = columns or [n for n in parquet.schema_arrow.names if "/" not in n]
+                names = list(dict.fromkeys([*names, *layout.place_columns(info)]))
+                rows += parquet.read(columns=names, use_threads=False).to_pylist()
+    with explained(path, LAYOUT):
+        rows.sort(key=lambda row: int(row["episode_index"]))
+        return layout.whole_episodes(path, info, rows, damage)
 
 
-def _v21_episodes(path: Path) -> list[dict[str, Any]]:
+def tables(path: Path, folder: str = "data") -> list[Path]:
+    """Return the tables in a folder of a dataset, in their order."""
+    return sorted((path / folder).rglob("*.parquet"))
+
+
+def _v21_episodes(path: Path, info: Any, damage: list[str]) -> list[dict[str, Any]]:
     """Return the episodes of layout v2.1, with the columns that v3.0 has for their files."""
-    info, rows, start = _info(path), [], 0
-    with explained(path / _V21, LAYOUT):
-        lines = read_regular(path / _V21, BUDGET).decode().splitlines()
-        stated = [parse_json(line) for line in lines if line.strip()]
-        for row in sorted(stated, key=lambda row: int(row["episode_index"])):
+    start, cameras = 0, features(path)[1]
+    with explained(path / V21, LAYOUT):
+        rows = json_lines(path / V21, damage)
+        rows.sort(key=lambda row: int(row["episode_index"]))
+        for row in rows:
             number = int(row["episode_index"])
             chunk = number // int(info["chunks_size"])
             row["data/chunk_index"], row["data/file_index"] = chunk, number
             row["dataset_from_index"], start = start, start + int(row["length"])
-            for key in features(path)[1]:
+            for key in cameras:
                 row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = chunk, number
                 row[f"videos/{key}/from_timestamp"] = 0.0
-            rows.append(row)
     return rows
 
 
-def _episodes(path: Path, columns: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the rows of the tables of episodes, in their order."""
-    import pyarrow.parquet as pq
-
-    rows: list[dict[str, Any]] = []
-    if (path / _V21).is_file():
-        return _v21_episodes(path)
-    files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
-    if not files:
-        raise LogDamagedError(
-            f"{path}: the tables of episodes (meta/episodes/*.parquet) are missing"
-        )
-    for file in files:
-        check_regular(file)
-        with limited(file, "PyArrow"):
-            table = pq.ParquetFile(file).read(columns=list(columns), use_threads=False)
-            rows += table.to_pylist()
-    with explained(path, LAYOUT):
-        return sorted(rows, key=lambda row: int(row["episode_index"]))
+def json_lines(file: Path, damage: list[str]) -> list[dict[str, Any]]:
+    """Return the values of the lines of a file; note in `damage` if the last one is cut."""
+    lines = [line for line in read_regular(file, BUDGET).splitlines() if line.strip()]
+    values = [parse_json(line) for line in lines[:-1]]
+    try:
+        values += map(parse_json, lines[-1:])
+    except ValueError:
+        damage.append(f"meta/{file.name} ends within a line")
+    return values
