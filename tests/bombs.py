@@ -38,7 +38,7 @@ METADATA = """rosbag2_bagfile_information:
                         offered_qos_profiles: ""}}
       message_count: 1
   compression_format: zstd
-  compression_mode: MESSAGE
+  compression_mode: {mode}
   relative_file_paths: [{name}]
 """
 
@@ -74,7 +74,14 @@ def database(path: Path, message: bytes) -> None:
 def packed_message(folder: Path) -> Path:
     (folder / "bag").mkdir()
     database(folder / "bag" / "a.db3", zeros(400))
-    (folder / "bag" / "metadata.yaml").write_text(METADATA.format(name="a.db3"))
+    (folder / "bag" / "metadata.yaml").write_text(METADATA.format(mode="MESSAGE", name="a.db3"))
+    return folder / "bag"
+
+
+def packed_file(folder: Path) -> Path:
+    (folder / "bag").mkdir()
+    (folder / "bag" / "a.db3.zstd").write_bytes(zeros(300))
+    (folder / "bag" / "metadata.yaml").write_text(METADATA.format(mode="FILE", name="a.db3.zstd"))
     return folder / "bag"
 
 
@@ -218,6 +225,7 @@ def table_of_pictures(folder: Path) -> Path:
 
 CAMERAS: dict[str, Writing] = {
     "packed message of .db3": packed_message,
+    "packed .db3": packed_file,
     "chunk of .bag": ros1_chunk,
     "PNG": a_picture("0.png", lambda: png(60_000)),
     "PNG in a message": log("foxglove.CompressedImage", "protobuf", [picture_message(60_000)]),

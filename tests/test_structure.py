@@ -44,6 +44,7 @@ FORBIDDEN = {
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.corpus": ("replay.viewer", "cdmisfa.experiments.session", "rerun"),
+    "replay.episodes": ("replay.viewer", "cdmisfa.agents.learner", "rerun"),
     "replay.export": ("replay.view.build", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer", "rerun"),
     "replay.logs": ("replay.open_sources", "replay.view.build", "recorder.recording", "rerun"),

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
 
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.names import counted
 from recorder.log.files import atomic_write
 from replay.episodes.ranking import Ranked, column_name
@@ -73,7 +73,8 @@ def _entry(ranked: Ranked, episode: int) -> dict[str, Any]:
     column = reasons[0][1] if reasons else None
     images: list[tuple[str, str, bool]] = []
     with suppress(CdmisfaError, OSError), ExitStack() as opened:
-        cameras = open_cameras(log, opened)
+        if not (cameras := open_cameras(log, opened)):
+            raise UsageError("the episode has no images")
         camera = cameras.get(column.camera if column else "", next(iter(cameras.values())))
         times = seconds(camera) - seconds(camera)[0]
         rows = {int(row) for row in np.linspace(0, len(times) - 1, IMAGES + 2)[1:-1]}

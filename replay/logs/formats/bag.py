@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import zstandard
 
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.untrusted import check_regular
+from cdmisfa.core.untrusted import check_regular, opened_regular
 from recorder.images.messages import MessageKind, decoder_of
 from recorder.images.options import InputOptions
+from recorder.mcap.records import MAX_CHUNK
 from replay.logs.formats.messages import choose_topics, left_out, message_stream
 from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, limited
 
@@ -24,6 +26,10 @@ METADATA: Final = "metadata.yaml"
 
 # Largest metadata.yaml that is read, in bytes.
 MAX_METADATA: Final = 1024 * 1024
+
+# Largest ratio of unpacked to packed size, against files that would fill the disk. Contents up to
+# the size of a chunk are always accepted. Only images of one color exceed the ratio.
+MOST_TIMES: Final = 100
 
 
 class Bag(NamedTuple):
@@ -162,6 +168,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     ros1 = path.suffix == ".bag" and path.is_file()
     if path.is_dir():
         check_regular(path / METADATA, MAX_METADATA)
+        for file in sorted(path.glob("*.zst*")):
+            _check_unpacked_size(file)
     else:
         check_regular(path)
     with limited(path, "rosbags"):
@@ -169,3 +177,14 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader.open()
     with contextlib.closing(reader):
         yield Bag(path, reader, ros1)
+
+
+def _check_unpacked_size(packed: Path) -> None:
+    """Raise LogDamagedError if a file unpacks to far too much, which rosbags does not check."""
+    with limited(packed, "zstd"), opened_regular(packed) as source:
+        size, most = 0, max(packed.stat().st_size * MOST_TIMES, MAX_CHUNK)
+        reader = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2).stream_reader(source)
+        while part := reader.read(1 << 20):
+            size += len(part)
+            if size > most:
+                raise LogDamagedError(f"{packed} unpacks to more than the limit of {most} bytes")
