@@ -32,13 +32,13 @@ CEILINGS = {
     "replay/corpus": 755,
     "replay/episodes": 1190,
     "replay/export": 764,
-    "replay/integrity": 1085,
-    "replay/logs": 2870,
+    "replay/integrity": 1120,
+    "replay/logs": 2976,
     "replay/report": 960,
     "replay/runs": 1410,
     "replay/storage": 290,
     "replay/view": 1960,
-    "tests": 19530,
+    "tests": 19615,
     "tools": 2080,
 }
 """Code lines allowed in each package: what it had when the ceiling was set, and 5 percent."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,13 +22,14 @@ from replay.integrity.listing import ListedLog, size_and_time
 from replay.integrity.report import failed
 from replay.logs.clock import missing
 from replay.logs.formats.lerobot import LAYOUT as DATASET
+from replay.logs.health import COLUMNS, Health, seconds
 from replay.logs.open_logs import identity_of, image_topics, is_external_format, open_stream
 from replay.logs.stream import ChannelInfo
 from replay.storage.identity import Identity, McapIdentity
 from replay.storage.location import is_url, location
 
 # Increased whenever a column changes its meaning; an index of another version is refused.
-VERSION: Final = 2
+VERSION: Final = 3
 
 # Key of the Parquet file's metadata that holds the version.
 MARK: Final = b"cdmisfa.corpus"
@@ -59,6 +61,7 @@ SCHEMA: Final = pa.schema(
         ("end_ns", pa.int64()),
         ("seconds", pa.float64()),
         ("gaps", pa.int64()),
+        *((name, pa.float64()) for name in COLUMNS),
         ("compression", _WORD),
         ("identity", pa.string()),
         ("crc", _WORD),
@@ -118,7 +121,7 @@ def _streams_of(place: Path, log: ListedLog, deep: bool) -> Iterator[dict[str, A
             report = describe_reader(reader, decode=False)
         if deep:
             report = describe_log(place, decode=True)
-        topics = image_topics(place) if deep and report.kind == "foreign" else []
+        topics = image_topics(place) if deep and report.kind != "run" else []
     problems = [f"{p.where}: {p.what}" for p in report.problems]
     if not is_url(log.file) and size_and_time(place) != (log.bytes, log.changed):
         problems.append("the file changed while it was indexed: index again")
@@ -138,8 +141,9 @@ def _streams_of(place: Path, log: ListedLog, deep: bool) -> Iterator[dict[str, A
         "problem": "; ".join(problem.replace(f"{place}: ", "") for problem in problems),
     }
     for channel in report.channels:
-        stream = shared | _summary(channel, metadata if report.kind == "recording" else {})
-        yield stream | (_decoded(place, channel.topic) if channel.topic in topics else {})
+        summary = _summary(channel, metadata if report.kind == "recording" else {})
+        decoded = _decoded(place, channel.topic) if channel.topic in topics else {}
+        yield shared | decoded | summary
     if not report.channels:
         yield shared
 
@@ -168,19 +172,22 @@ def _summary(channel: ChannelInfo, view: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _decoded(place: Path, topic: str) -> dict[str, Any]:
-    """Return the shape of the first image of a topic, and the number of missing images."""
+    """Return shape and health of the images of a topic, and the number of missing images."""
     try:
         with open_stream(place, topic) as stream:
             shape = "x".join(map(str, stream.image(0).shape))
             gaps = 0 if stream.times is None else int(missing(stream.times).sum())
             if stream.program == DATASET:  # it pauses between episodes, where nothing is missing
                 gaps = 0
-                for row in range(stream.count):
-                    try:
-                        stream.fetch(row)
-                    except MalformedRecord:
-                        gaps += 1
-            return {"shape": shape, "gaps": gaps}
+            health = Health()
+            for row, time in enumerate(seconds(stream).tolist()):
+                try:
+                    health.add(time, functools.partial(stream.image, row))
+                except MalformedRecord:
+                    gaps += stream.program == DATASET
+                except LogDamagedError:
+                    continue  # `verify` names every broken image
+            return {"shape": shape, "gaps": gaps, **health.columns()}
     except LogDamagedError as error:
         return {"problem": str(error).removeprefix(f"{place}: ")}
     except (MalformedRecord, UsageError):  # the topic has no image

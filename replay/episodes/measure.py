@@ -15,6 +15,7 @@ from PIL import Image
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from recorder.images.pixels import MalformedImage
 from recorder.log.files import atomic_write
+from replay.logs.health import BLACK, WHITE
 
 # Width of the view of an image, in pixels: larger ones are averaged over whole blocks of pixels.
 # Wide enough to measure a shift of the camera by a pixel, small enough for 30 images/s of 640x480.
@@ -22,10 +23,6 @@ VIEW: Final = 128
 
 # Width of the thumbnail that features are learned from, in pixels.
 THUMBNAIL: Final = 16
-
-# Brightness below which a pixel is black, and above which it is saturated.
-BLACK: Final = 16
-WHITE: Final = 250
 
 # Images that the view without moving things is the median of.
 STILLS: Final = 8

@@ -24,6 +24,7 @@ from replay.integrity.info import describe_log
 from replay.integrity.listing import ListedLog, find_logs
 from replay.logs.formats import lerobot
 from replay.logs.formats.messages import NoTopicError
+from replay.logs.health import RATE, seconds
 from replay.logs.open_logs import ALL, FORMATS, Format, log_format
 from replay.logs.stream import BROKEN, LogStream
 from replay.open_sources import is_recording, locations
@@ -36,9 +37,6 @@ VERSION: Final = 1
 
 # Words in the names of topics with commands, not states.
 COMMANDS: Final = ("action", "command", "cmd", "target", "goal", "desired", "leader")
-
-# Images per second of a log that states no times.
-RATE: Final = 30.0
 
 # Formats of logs with topics.
 _WITH_TOPICS: Final = ("mcap", "split", "bag")
@@ -220,13 +218,6 @@ def _of_episode(log: EpisodeLog, stream: LogStream) -> LogStream:
         return stream
     rows = np.arange(log.first, log.first + log.count)
     return stream.part(rows, stream.times[rows])
-
-
-def seconds(stream: LogStream) -> FloatArray:
-    """Return the time of each row of a stream (s)."""
-    if stream.times is None:
-        return np.arange(stream.count) / RATE
-    return np.asarray(stream.times / 1e9, np.float64)
 
 
 def measure_episode(log: EpisodeLog) -> Measured:

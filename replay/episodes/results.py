@@ -17,7 +17,8 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.names import counted
 from recorder.log.files import atomic_write
 from replay.episodes.ranking import Ranked, column_name
-from replay.episodes.reading import open_cameras, seconds
+from replay.episodes.reading import open_cameras
+from replay.logs.health import seconds
 from replay.report.page import rendered
 from replay.report.svg_plot import WIDE, Axis, Plot
 

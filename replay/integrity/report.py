@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.mcap.records import Problem
+from replay.logs.health import Health
 from replay.logs.stream import ChannelInfo
 
 if TYPE_CHECKING:
@@ -108,6 +109,7 @@ class LogReport:
         notes: remarks that are no problems.
         size: bytes.
         library: writer of the file; "" for several writers.
+        health: of each stream of images its columns, see `Health`; `verify` measures it.
         files: report on each file.
     """
 
@@ -128,6 +130,7 @@ class LogReport:
     notes: tuple[str, ...] = ()
     size: SizeInfo = SizeInfo()
     library: str = ""
+    health: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     files: tuple[LogReport, ...] = ()
 
     @property
@@ -166,6 +169,7 @@ class LogReport:
         document = asdict(self)
         for report, values in zip((self, *self.files), (document, *document["files"]), strict=True):
             values["seconds"] = report.seconds
+            del values["health"]
             for channel, entry in zip(report.channels, values["channels"], strict=True):
                 entry["rate"] = channel.rate
         return {"schema": SCHEMA, **document}
@@ -177,7 +181,15 @@ class LogReport:
             "ok": self.ok,
             "state": self.state,
             "problems": [asdict(problem) for problem in self.problems],
-            "files": [{"file": f.path, "crc": f.crc, "state": f.state} for f in self.files],
+            "files": [
+                {
+                    "file": f.path,
+                    "crc": f.crc,
+                    "state": f.state,
+                    "streams": [{"topic": topic, **columns} for topic, columns in f.health.items()],
+                }
+                for f in self.files
+            ],
             "notes": self.notes,
         }
 
@@ -222,6 +234,15 @@ def combined(
         library=libraries.pop() if len(libraries) == 1 else "",
         files=tuple(files),
     )
+
+
+def with_health(report: LogReport, streams: Mapping[str, Health]) -> LogReport:
+    """Add the health of streams, with a note on each in which something is remarkable."""
+    health = {topic: stream.columns() for topic, stream in streams.items()}
+    remarks = {topic: stream.remark() for topic, stream in streams.items()}
+    notes = [f"{report.path}: {topic}: {text}" for topic, text in remarks.items() if text]
+    health = {topic: columns for topic, columns in health.items() if columns}
+    return replace(report, health=health, notes=(*report.notes, *notes))
 
 
 def failed(place: str | Path, error: CdmisfaError) -> LogReport:

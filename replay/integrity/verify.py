@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import itertools
 import json
@@ -16,14 +17,23 @@ import numpy as np
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SignalsHash
 from cdmisfa.core.untrusted import read_regular
+from recorder.log.messages import view_topic
 from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import Problem, Segment
 from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
 from replay.integrity.listing import each_report
-from replay.integrity.report import LogReport, State, as_problem, combined, failed
+from replay.integrity.report import (
+    LogReport,
+    State,
+    as_problem,
+    combined,
+    failed,
+    with_health,
+)
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
 from replay.logs.formats.recording import ViewFile
+from replay.logs.health import Health, seconds
 from replay.logs.open_logs import (
     channels_of,
     image_topics,
@@ -88,6 +98,7 @@ def _check_file(path: Path, *, beside: bool) -> tuple[LogReport, _Content | None
         images = _check_topics(path, image_topics(path))
         notes = (*report.notes, *images.notes)
         report = replace(report, problems=images.problems, notes=notes, state=images.state)
+        report = replace(report, health=images.health)
     return report, content
 
 
@@ -110,7 +121,8 @@ def _check_content(
         problems.append(Problem(str(path), what))
     report = report_on(reader, counts)
     notes = (f"{path}: {NO_CHECKSUMS}",) if report.crc == "absent" else ()
-    return replace(report, problems=(*problems, *report.problems), notes=notes), content
+    report = replace(report, problems=(*problems, *report.problems), notes=notes)
+    return with_health(report, content.health if content else {}), content
 
 
 def _content_of(path: Path, reader: LogReader, beside: bool) -> _Content | None:
@@ -129,11 +141,13 @@ class _Content:
     Attributes:
         path: the log.
         error: the error at which the check ended.
+        health: health of each stream of images.
     """
 
     def __init__(self, path: Path, reader: LogReader) -> None:
         self.path, self.reader = path, reader
         self.error: CdmisfaError | None = None
+        self.health: dict[str, Health] = {}
 
     def add(self, segment: Segment) -> None:
         """Check the next chunk of the log."""
@@ -164,8 +178,11 @@ class _ImageContent(_Content):
         if len(rows):
             check_times(self.path, np.sort(table.log_time[rows]).astype(np.int64))
         with limited(self.path, "its decoder", memory_bytes=table.data.nbytes):
-            for row in rows.tolist():
-                self._decoders[int(table.channel[row])](table.view(row))
+            for row in rows[np.argsort(table.log_time[rows], kind="stable")].tolist():
+                channel = int(table.channel[row])
+                health = self.health.setdefault(self.reader.channels[channel].topic, Health())
+                read = functools.partial(self._decoders[channel], table.view(row))
+                health.add(int(table.log_time[row]) / 1e9, read)
 
 
 class _ViewContent(_Content):
@@ -180,7 +197,8 @@ class _ViewContent(_Content):
     def add(self, segment: Segment) -> None:
         if self.view is not None and self.error is None:
             with self.record_errors():
-                self.view.check_chunk(segment)
+                topic = view_topic(self.view.facts.view)
+                self.view.check_chunk(segment, self.health.setdefault(topic, Health()))
 
     def finish(self) -> None:
         if self.view is not None:
@@ -327,14 +345,16 @@ def _check_external(path: Path) -> LogReport:
 def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ()) -> LogReport:
     """Decode every image on some topics of a camera log; `absent` parts are reported with it."""
     problems: list[Problem] = []
+    health: dict[str, Health] = {}
     missing = dict.fromkeys(absent)
     notes: dict[str, None] = {}
     for topic in topics:
         try:
             with open_stream(path, topic) as stream:
-                for row in range(stream.count):
+                measured = health.setdefault(topic, Health())
+                for row, time in enumerate(seconds(stream).tolist()):
                     try:
-                        stream.image(row)
+                        measured.add(time, functools.partial(stream.image, row))
                     except LogDamagedError as error:
                         problems.append(Problem(stream.name_of(row), str(error)))
                 missing |= dict.fromkeys([stream.missing] if stream.missing else [])
@@ -347,4 +367,5 @@ def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ())
     state: State = "damaged" if problems else "cut short" if missing else "whole"
     problems += [Problem(str(path), what) for what in missing]
     remarks = tuple(note for note in notes if note.removeprefix(f"{path}: ") not in missing)
-    return LogReport(str(path), problems=tuple(problems), state=state, notes=remarks)
+    report = LogReport(str(path), problems=tuple(problems), state=state, notes=remarks)
+    return with_health(report, health)

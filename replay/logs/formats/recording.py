@@ -6,6 +6,7 @@ A block is copied out of its chunks by the kernel `gather`, without a Python obj
 from __future__ import annotations
 
 import bisect
+import functools
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,6 +38,7 @@ from recorder.mcap.chunks import MessageTable
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Segment
 from replay.logs.clock import intersection
+from replay.logs.health import Health
 from replay.logs.stream import explained
 from replay.stored_source import Span
 
@@ -120,8 +122,8 @@ class ViewFile:
         for _, which, number, low, at, stop in sorted(pieces):  # each chunk is decoded once
             self._channels[which].read(number, low, stop - at, outs[which][at:stop])
 
-    def check_chunk(self, segment: Segment) -> None:
-        """Check every frame of the next chunk of the file, without copying any.
+    def check_chunk(self, segment: Segment, health: Health) -> None:
+        """Check every frame of the next chunk of the file, and measure its images.
 
         Raises:
             LogDamagedError: a time is no frame's, or a message is laid out unlike the others.
@@ -133,7 +135,13 @@ class ViewFile:
             in_chunk = rows.segments and rows.segments[-1] is segment
             if in_chunk and rows.layout is not None and self.reader.table(segment) is not None:
                 number, count = len(rows.segments) - 1, rows.starts[-1] - rows.starts[-2]
-                rows.read(number, 0, count, None)
+                images = self.facts.spec.images and rows is self._channels[0]
+                frames = np.empty((count, rows.width), np.uint8) if images else None
+                rows.read(number, 0, count, frames)
+                if frames is not None:
+                    for time, frame in zip(rows.times(number).tolist(), frames, strict=True):
+                        image = frame.reshape(self.facts.frame_shape)
+                        health.add(time / 1e9, functools.partial(np.asarray, image))
 
     def finish(self) -> None:
         """Set `ranges`, after the last chunk."""
@@ -249,7 +257,7 @@ class _ChannelRows:
         if self._count_messages(segment):
             number = len(self.segments) - 1
             if not (self._reader.skip_damaged and self._reader.table(segment) is None):
-                self._number(self._times(number), self.starts[number], self.ranges)
+                self._number(self.times(number), self.starts[number], self.ranges)
 
     def payload(self, frame: int) -> bytes:
         """Return the message of a frame."""
@@ -324,8 +332,8 @@ class _ChannelRows:
             else:
                 ranges.append(_RowRange(start, start + count, row + low))
 
-    def _times(self, number: int) -> NDArray[np.uint64]:
-        """Log times of the channel's messages in a chunk."""
+    def times(self, number: int) -> NDArray[np.uint64]:
+        """Return the log times (ns) of the channel's messages in a chunk."""
         segment, channel = self.segments[number], self._channel.id
         if not segment.indexes:
             table = self._table(number)
