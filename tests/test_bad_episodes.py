@@ -16,7 +16,10 @@ from conftest import Cdmisfa
 from hypothesis import given
 from hypothesis import strategies as st
 
+from replay.episodes.features import features_of
 from replay.episodes.images import shift
+from replay.episodes.lag import Lag, lag_column
+from replay.episodes.measure import CameraMeter, Measured
 from replay.episodes.numbers import column, longest
 from replay.episodes.ranking import rank_episodes
 from replay.episodes.reasons import REASONS, scores
@@ -182,6 +185,42 @@ def write_film(file: Path, images: np.ndarray) -> None:
         for image in images:
             out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         out.mux(stream.encode())
+
+
+def log(late: int, seed: int) -> Measured:
+    """Return measures of a log of 60 s: a square that moves as one of two joints, and is late."""
+    rng, count = np.random.default_rng(seed), 1200
+    steps = rng.normal(0, 1, (2, count + 8))
+    joints = np.array([np.convolve(row, np.hanning(9), "valid") for row in steps])
+    meter = CameraMeter(np.sort(np.arange(count) / FPS + rng.uniform(-0.004, 0.004, count)))
+    for row in range(count):
+        image = rng.integers(90, 96, (48, 64, 3)).astype(np.uint8)
+        x = int(np.clip(28 + 8 * joints[0, max(row - late, 0)], 0, 56))
+        image[20:28, x : x + 8] = (230, 120, 40)
+        meter.add(row, image)
+    camera = meter.result()
+    assert camera is not None
+    return Measured("log", {"cam": camera}, {"state": (np.arange(count) / FPS, joints.T)})
+
+
+def lag_of(episode: Measured) -> Lag:
+    cameras = [episode.cameras["cam"]]
+    lag = lag_column([episode], "cam", features_of(cameras).slow)
+    assert lag is not None
+    return lag[2]
+
+
+@pytest.mark.parametrize("late", [0, 6])
+def test_the_lag_of_one_log_follows_from_the_joints_that_images_show(late: int) -> None:
+    lag = lag_of(log(late, 1))
+    assert lag.certain
+    assert abs(lag.seconds - late / FPS) <= 1 / FPS
+
+
+def test_no_lag_is_certain_if_images_show_other_motion() -> None:
+    other = log(0, 3)
+    other.numbers = log(0, 4).numbers
+    assert not lag_of(other).certain
 
 
 @given(st.integers(-6, 6), st.integers(-6, 6))

@@ -151,6 +151,8 @@ def shift(a: FloatArray, b: FloatArray) -> float:
 
     c = F^-1(A B* / (|A B*| + 0.05 mean |A B*|)), the largest c, A and B with Hann windows
     """
+    if a.shape[0] < BLOCKS[0] or a.shape[1] < BLOCKS[1]:
+        return 0.0
     window = np.hanning(a.shape[0])[:, None] * np.hanning(a.shape[1])
     one, two = (np.fft.rfft2((image - image.mean()) * window) for image in (a, b))
     product = one * two.conj()

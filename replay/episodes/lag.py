@@ -27,6 +27,9 @@ RIDGE: Final = 10.0
 # Parts of an episode, or of all episodes, that are left out in turn to find the uncertainty.
 PARTS: Final = 10
 
+# Least correlation of a joint, over the largest one of all, for the lag of all together.
+VISIBLE: Final = 0.8
+
 # A lag is measured from this correlation on, in itself and in its standard errors, this much above
 # the second peak, and up to this standard error in frames, of an episode with at least this share
 # of the typical motion. Set on simulated arms and moving squares.
@@ -136,7 +139,8 @@ def _ridge(gram: FloatArray, product: FloatArray) -> FloatArray:
 def _predicted(changes: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
     """Return sums (parts, lags, 3) of products of states and estimates from images of other parts.
 
-    The three are estimate x state, estimate x estimate, and state x state, over joints.
+    The three are estimate x state, estimate x estimate, and state x state, over the joints that
+    images show well: of the others the lag is not right.
     """
     many = max(-(-PARTS // len(changes)), 1)
     parts = [
@@ -151,8 +155,10 @@ def _predicted(changes: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
     for (f, s), part_gram, part_product in zip(parts, grams, products, strict=True):
         weights = _ridge(gram - part_gram, product - part_product)
         estimate = np.einsum("ti,lin->tln", f, weights, optimize=True)
-        sums.append(_sums(estimate, s))
-    return np.stack(sums)
+        sums.append(np.stack([_sums(estimate[..., [j]], s[..., [j]]) for j in range(s.shape[2])]))
+    of_joints = np.stack(sums)
+    visible = np.array([_correlation(joint).max() for joint in of_joints.sum(0)])
+    return np.asarray(of_joints[:, visible >= VISIBLE * visible.max()].sum(1))
 
 
 def _fitted(changes: Sequence[tuple[FloatArray, FloatArray]], middle: int) -> Iterator[FloatArray]:

@@ -60,8 +60,10 @@ def scaled(episodes: Sequence[Measured], kind: str) -> Numbers | None:
         return None
     numbers = [episode.numbers[kind] for episode in episodes]
     deviation = np.concatenate([values for _, values in numbers]).std(0)
-    steps = np.concatenate([np.diff(values, axis=0) for _, values in numbers]).std(0)
-    moving = (deviation > 1e-9) & (steps < NOISE * deviation)
+    steps = np.concatenate([np.diff(values, axis=0) for _, values in numbers])
+    if not len(steps):
+        return None
+    moving = (deviation > 1e-9) & (steps.std(0) < NOISE * deviation)
     scaled = [(times, values[:, moving] / deviation[moving]) for times, values in numbers]
     return scaled if moving.any() else None
 

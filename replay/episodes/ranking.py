@@ -245,6 +245,7 @@ def _columns_of(ranked: Ranked, name: str, group: IntArray) -> Iterator[tuple[In
     ]
     numbers = _alike(ranked, group, sizes, "joint states and actions")
     yield from ((numbers, c) for c in number_columns([measured[i] for i in numbers]))
+    group = numbers if 2 * len(numbers) > len(group) else group  # the others have a defect
     for camera in dict.fromkeys(name for i in group for name in measured[i].cameras):
         images = [measured[i].cameras.get(camera) for i in group]
         having = _alike(
