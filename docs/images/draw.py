@@ -5,6 +5,7 @@ With names of images, only those. Complete runs in build/images and build/galler
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from PIL import Image
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import demonstrations
@@ -84,6 +86,9 @@ REPORTS = {
     "gallery-rejected": ("runs/rejected", "900,790"),
 }
 
+# Images of pages of bad episodes, and the size of the browser's window.
+EPISODES = {"episodes": "900,1080"}
+
 
 def must(*words: str) -> None:
     """Run a command that succeeds."""
@@ -123,11 +128,11 @@ def draw_view(name: str) -> None:
     save(drawn, top=MENU)
 
 
-def save(drawn: Path, top: int = 0) -> None:
+def save(drawn: Path, top: int = 0, method: int = Image.Quantize.MAXCOVERAGE) -> None:
     """Save an image for the pages: without its top, and with fewer colors."""
     with Image.open(drawn) as image:
         part = image.convert("RGB").crop((0, top, *image.size))
-        part.quantize(COLORS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        part.quantize(COLORS, method=method, dither=Image.Dither.NONE).save(
             IMAGES / drawn.name, optimize=True
         )
 
@@ -137,20 +142,50 @@ def draw_report(name: str) -> None:
     source, size = REPORTS[name]
     page, drawn = BUILD / f"{name}.html", BUILD / f"{name}.png"
     must("report", str(learned(source)), "-o", str(page), "--force")
+    screenshot(page, drawn, size)
+
+
+def screenshot(
+    page: Path, drawn: Path, size: str, method: int = Image.Quantize.MAXCOVERAGE
+) -> None:
+    """Draw the top of a page in Chromium."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         raise SystemExit("no browser: apt-get install chromium")
     flags = ("--headless", "--no-sandbox", "--hide-scrollbars", f"--window-size={size}")
     words = [browser, *flags, f"--screenshot={drawn}", page.resolve().as_uri()]
     subprocess.run(words, check=True, capture_output=True)
-    save(drawn)
+    save(drawn, method=method)
+
+
+def draw_episodes(name: str) -> None:
+    """Draw the top of the page of bad episodes, of simulated ones with planted faults."""
+    from benchmarks.robot_episodes import CAMERAS, dataset, make_pool
+
+    pool, data, out = BUILD / "pool", BUILD / "stack", BUILD / "check"
+    if not data.exists():
+        make_pool(pool / "stack", "stack", 7001, 12, 1)
+        rows = json.loads((pool / "stack/pool.json").read_text())
+        good = [row for row in rows if not row["fault"]]
+        bad = [row for row in rows if row["fault"] in ("black", "frozen", "lag", "object")]
+        dataset(data, [{**row, "pool": str(pool)} for row in (*good, *bad)], CAMERAS)
+    must("episodes", str(data), "-o", str(out))
+    page = out / "episodes.html"
+    page.write_text(page.read_text().replace(str(data.resolve()), "datasets/stack"))
+    # Photographs have more shades than the colors that `MAXCOVERAGE` keeps.
+    screenshot(page, BUILD / f"{name}.png", EPISODES[name], Image.Quantize.MEDIANCUT)
 
 
 def main(names: Sequence[str]) -> None:
     """Draw the images that are named, by default all."""
     BUILD.mkdir(parents=True, exist_ok=True)
-    for name in names or [*VIEWS, *REPORTS]:
-        (draw_report if name in REPORTS else draw_view)(name)
+    draw = {
+        **dict.fromkeys(VIEWS, draw_view),
+        **dict.fromkeys(REPORTS, draw_report),
+        **dict.fromkeys(EPISODES, draw_episodes),
+    }
+    for name in names or draw:
+        draw[name](name)
 
 
 if __name__ == "__main__":
