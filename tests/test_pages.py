@@ -59,4 +59,4 @@ def test_readme_has_whole_addresses_where_its_files_are_elsewhere(
 def test_pictures_are_those_that_the_code_draws() -> None:
     drawn = runpy.run_path(str(IMAGES / "draw.py"))
     names = {path.stem for path in IMAGES.glob("*.png")}
-    assert names == {*drawn["VIEWS"], *drawn["REPORTS"], "scene"}
+    assert names == {*drawn["VIEWS"], *drawn["REPORTS"], *drawn["EPISODES"], "scene"}
