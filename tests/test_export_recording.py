@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from camera_files import RAW, raw
 from folders import contents
+from mcap.writer import Writer
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
+from recorder.images.messages import MessageKind
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.export import frames
@@ -24,6 +27,8 @@ ROOT = Path(__file__).parents[1]
 FRAMES = 53
 TRUTH = ("ball_x", "ball_y")
 VIEWS = ("left", "right")
+JOINTS, GRIP = MessageKind("JointState", "json"), MessageKind("Grip", "json")
+NOTE = MessageKind("Note", "json")
 
 
 def record_images(folder, shape=(24, 40), views=VIEWS, fps=50.0, seed=0):
@@ -209,7 +214,7 @@ def test_a_dataset_of_a_task_has_states_actions_and_episodes(cdmisfa, tmp_path, 
 
 REFUSED = {
     "has 2 streams: choose a folder": ("r", "mp4", "one.mp4", {}),
-    "convert --rate": ("r", "lerobot", "out", {}),
+    "resample with --rate 30": ("r", "lerobot", "out", {}),
     r"there\.mp4 exists": ("r", "mp4", "there.mp4", {}),
     "did you mean npz": ("r", "npy", "out", {}),
     r"mine has files that no export wrote, as thesis\.tex": (
@@ -244,3 +249,45 @@ def test_force_replaces_an_earlier_export(tmp_path):
         (tmp_path / "out" / name / "00000000.png").touch()
     assert export(tmp_path / "r", tmp_path / "out", "images", force=True) == len(pixels[0])
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["left"]
+
+
+def test_a_dataset_of_logs_has_every_numeric_topic_and_images_as_they_are(cdmisfa, tmp_path):
+    count, step, start = 20, 20_000_000, 10**18
+    colors = np.random.default_rng(0).integers(0, 256, (count, 90, 120, 3), dtype=np.uint8)
+    kinds = {"/cam": RAW, "/joints": JOINTS, "/cmd": JOINTS, "/grip": GRIP, "/note": NOTE}
+    for name, shift in (("a", 0), ("b", 5)):
+        with open(tmp_path / f"{name}.mcap", "wb") as file:
+            writer = Writer(file)
+            writer.start()
+            for topic, kind in kinds.items():
+                schema = writer.register_schema(kind.schema, "protobuf", kind.definition)
+                channel = writer.register_channel(topic, kind.encoding, schema)
+                for i in range(count):
+                    number = shift + i
+                    data = raw(colors[i], "rgb8")
+                    if kind is not RAW:
+                        position = [number, number / 2] if topic == "/joints" else [-number, 1]
+                        values = {"position": position, "velocity": [number * 3], "width": number}
+                        data = json.dumps({"text": "x"} if kind is NOTE else values).encode()
+                    late = 1_000_000 if topic == "/joints" else 0
+                    writer.add_message(channel, start + i * step + late, data, 0)
+            writer.finish()
+    words = "--to", "lerobot", "--lossless", "--state", "/joints:position[0:1]"
+    done = cdmisfa(
+        "export", tmp_path, *words, "--state", "/grip:width", "-o", tmp_path / "d", "--json"
+    )
+    assert done.code == 0, done.err
+    assert [line for line in done.json["warnings"] if "/note is left out" in line]
+    data = pq.read_table(tmp_path / "d/data/chunk-000/file-000.parquet").to_pydict()
+    numbers = [*range(count), *range(5, 5 + count)]
+    assert data["episode_index"] == [0] * count + [1] * count
+    assert data["observation.state"] == [[n, n] for n in numbers]
+    assert data["action"] == [[-n, 1] for n in numbers]
+    assert data["observation.joints"] == [[n, n / 2, n * 3, n] for n in numbers]
+    import av
+
+    for number in (0, 1):
+        video = tmp_path / "d/videos/observation.images.cam/chunk-000" / f"file-00{number}.mp4"
+        with av.open(str(video)) as container:
+            images = [image.to_ndarray(format="rgb24") for image in container.decode(video=0)]
+        np.testing.assert_array_equal(images, colors)

@@ -18,6 +18,9 @@ _MAX_NAME = 64
 # hold a joint angle of the robot.
 ACTION, BEGINS, JOINT = "action_", "begins_", "head_"
 
+# Words in the names of topics with commands, not states.
+COMMANDS = ("action", "command", "cmd", "target", "goal", "desired", "leader")
+
 
 def counted(number: int, noun: str, form: str = "") -> str:
     """Return a count with its noun, such as "1 block" or "2 blocks".
@@ -38,6 +41,11 @@ def kind_of_frames(shape: tuple[int, ...]) -> str:
 def duration_text(seconds: float | None) -> str:
     """Return a duration such as "1:02:03", or "-" for None."""
     return "-" if seconds is None else str(timedelta(seconds=round(seconds)))
+
+
+def is_command(topic: str) -> bool:
+    """Return whether a topic of joints holds commands instead of states, by its name."""
+    return any(word in topic.lower() for word in COMMANDS)
 
 
 def stream_name(label: str) -> str:

@@ -106,7 +106,7 @@ class ArraySource(SteppedSource):
             )
         given_frames = [(n, present if f is None else f) for n, f in first.items()]
         frames = [np.atleast_1d(as_array(frame, str(name))) for name, frame in given_frames]
-        kinds = [framing.kind for framing in framings(frames, size, "crop")]
+        kinds = [framing.kind for framing in framings(frames, size, "crop", color=False)]
         rate = getattr(streams, "fps", 50.0) if fps is None else fps
         spec = SourceSpec.of_kinds([*map(str, first)], kinds, (), rate, start_ns, length)
         self.gaps = length is None

@@ -36,12 +36,14 @@ class Framing:
         size: (height, width) of a frame; (count,) for numbers.
         fit: how images of another aspect ratio become frames, see `fitted`.
         color: True if a frame shows the red, green and blue images side by side.
+        native: True for frames (height, width, 3), or (height, width, 1) without `color`.
     """
 
     first: tuple[int, ...]
     size: tuple[int, ...]
     fit: Fit = "crop"
     color: bool = False
+    native: bool = False
 
     def frame(self, image: Content) -> Content:
         """Convert an image, (height, width[, 3]), or the numbers of a message to a frame.
@@ -58,10 +60,16 @@ class Framing:
                     f"a part of the field, such as --field position[0:{least}]"
                 )
             return image
+        if self.native and (image.ndim == 3) != self.color:
+            raise UsageError("its images change between gray and color: use --color off")
+        if self.native and size_of(image) == self.size:
+            return image.reshape(self.shape)
         height, width = self.size
         enlarge = size_of(image) != self.first
         planes = [image] if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
         frames = [fitted(p, (height, width), self.fit, enlarge=enlarge) for p in planes]
+        if self.native:
+            return np.dstack(frames)
         if not self.color:
             return frames[0]
         return np.hstack(frames if len(frames) == 3 else frames * 3)
@@ -79,7 +87,9 @@ class Framing:
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of a frame."""
-        return (*self.size[:-1], self.size[-1] * (3 if self.color else 1))
+        channels = 3 if self.color else 1
+        wide = (*self.size[:-1], self.size[-1] * channels)
+        return (*self.size, channels) if self.native else wide
 
     @property
     def kind(self) -> FrameKind:
@@ -108,7 +118,7 @@ class Framing:
 
 
 def framings(
-    firsts: Sequence[Content], size: Size | None, fit: Fit, *, color: bool = False
+    firsts: Sequence[Content], size: Size | None, fit: Fit, *, color: bool, native: bool = False
 ) -> Sequence[Framing]:
     """Choose how images become frames of one shape, and numbers frames as they are.
 
@@ -117,20 +127,24 @@ def framings(
         size: (height, width) of a frame; None: the `default_size` for the first image.
         fit: see `fitted`.
         color: True to show the red, green and blue images side by side.
+        native: True to keep size and colors of the images.
 
     Raises:
         UsageError: an option for images is set, and no stream has images.
     """
     images = [first for first in firsts if first.ndim > 1]
-    image_options = {"--size": size is not None, "input.fit": fit != "crop", "--color": color}
+    in_color = color and not native
+    image_options = {"--size": size is not None, "input.fit": fit != "crop", "--color": in_color}
     refused = [option for option, chosen in image_options.items() if chosen]
     if refused and not images:
         raise UsageError(f"the frames are numbers: {are_for(refused, 'images')}")
-    size = size or (default_size(size_of(images[0])) if images else None)
+    common = size or (default_size(size_of(images[0])) if images else (0, 0))
     return [
         Framing((), first.shape)
-        if size is None or first.ndim < 2
-        else Framing(size_of(first), size, fit, color)
+        if first.ndim < 2
+        else Framing(size_of(first), size or size_of(first), fit, first.ndim == 3, native=True)
+        if native
+        else Framing(size_of(first), common, fit, color)
         for first in firsts
     ]
 

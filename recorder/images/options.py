@@ -54,8 +54,9 @@ Clock = Literal["log", "header"]
 # Frames while a camera paused: none, or its last image.
 Gaps = Literal["skip", "hold"]
 
-# How streams with different times get one clock: by index, or by the last image at each time.
-Align = Literal["index", "time"]
+# How streams with different times get one clock: by index, by the last image at each time, or by
+# the nearest one.
+Align = Literal["index", "time", "nearest"]
 
 # Reaction to a live stream that stalls or disconnects.
 OnLoss = Literal["reconnect", "wait", "end"]
@@ -128,6 +129,8 @@ class InputOptions(InputConfig):
         end: time of the log at which frames end (s); None: its end.
         align: how streams with different times get one clock; None: refuse them.
         color: True to show the red, green and blue images side by side.
+        native: True for frames (height, width, 3 or 1) of the size and colors of their images,
+            unless `size` or `color` change them.
     """
 
     topics: tuple[str, ...] = ()
@@ -138,6 +141,7 @@ class InputOptions(InputConfig):
     end: float | None = key(None, 0)
     align: Align | None = None
     color: Color = False
+    native: bool = False
 
     @classmethod
     def key_name(cls, name: str) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.names import stream_names
+from cdmisfa.core.names import is_command, stream_names
 from recorder.images.options import InputOptions
 from replay.episodes.measure import CameraMeter, Measured
 from replay.integrity.info import describe_log
@@ -34,9 +34,6 @@ from replay.storage.paths import natural_order, no_such
 
 # Increased whenever a measure changes, so that stored ones are not used any more.
 VERSION: Final = 1
-
-# Words in the names of topics with commands, not states.
-COMMANDS: Final = ("action", "command", "cmd", "target", "goal", "desired", "leader")
 
 # Formats of logs with topics.
 _WITH_TOPICS: Final = ("mcap", "split", "bag")
@@ -177,7 +174,7 @@ def read_numbers(log: EpisodeLog, opened: ExitStack) -> dict[str, Rows]:
         files = sorted(path.glob("*.mcap")) if format == "split" else [path]
         reports = [describe_log(file, decode=False) for file in files]
         for channel in (channel for report in reports for channel in report.channels):
-            command = any(word in channel.topic.lower() for word in COMMANDS)
+            command = is_command(channel.topic)
             names = topics["action" if command else "state"]
             if channel.schema.endswith("JointState") and channel.messages:
                 names += [channel.topic] if channel.topic not in names else []

@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Final
 
 from cdmisfa.core.errors import UsageError, did_you_mean
-from recorder.images.options import InputOptions
+from recorder.images.options import Align, InputOptions
 from recorder.log.files import atomic_write, refuse_existing, refuse_taken
 from replay.export.frames import write_images, write_video, write_videos
-from replay.export.lerobot import write_dataset
+from replay.export.lerobot import DatasetOptions, write_dataset
+from replay.export.numbers import log_topics
 from replay.export.tables import NUMBERS, TABLES, topics_of, write_streams
+from replay.logs.formats.views import SeveralRecordingsError
+from replay.logs.open_logs import ALL, image_logs, log_format
 from replay.logs.source import LoggedSource
 from replay.open_sources import Announce, holds_run, is_recording, open_for_viewing
 
@@ -33,6 +36,9 @@ def export(
     lossless: bool = False,
     inputs: InputOptions | None = None,
     task: str | None = None,
+    state: Sequence[str] = (),
+    action: Sequence[str] = (),
+    color: bool = True,
     about: Announce = lambda source: None,
     warn: Callable[[str], None] = lambda line: None,
 ) -> int:
@@ -40,7 +46,7 @@ def export(
 
     Args:
         path: a run, or logs of numbers, for a table; a recording or logs for the other forms.
-            Several folders of recordings become episodes of one LeRobot dataset.
+            Several recordings, or logs that share topics, become episodes of one LeRobot dataset.
         out: file of a table or of the video of one stream, *.mp4; folder of the other forms, and
             for the tables or videos of several streams.
         form: one of `FORMS`.
@@ -48,6 +54,9 @@ def export(
         lossless: keep every value of images in a video.
         inputs: options of logs; by default all streams of images.
         task: description of the task of a LeRobot dataset; by default that of the log.
+        state: numbers that become `observation.state` of a LeRobot dataset; see `DatasetOptions`.
+        action: numbers that become its `action`.
+        color: keep the colors of images.
         about: called with the opened recording or logs, of images or for a LeRobot dataset.
         warn: called with each warning that `about` does not state.
 
@@ -81,13 +90,18 @@ def export(
     if is_of_run:
         with atomic_write(out) as place:
             return TABLES[form](paths[0], place)
+    inputs = inputs or InputOptions()
     if form in NUMBERS:  # each row keeps its time
-        inputs = replace(inputs or InputOptions(), align="time")
+        inputs = replace(inputs, align="time")
+    else:
+        align: Align | None = "nearest" if form == "lerobot" else None
+        inputs = replace(inputs, align=align, native=True, color=color)
     logs = _opened(paths, form, inputs, about, warn, single=single)
     with contextlib.closing(logs), atomic_write(out) as place:
         if form == "lerobot":
-            return write_dataset(logs, place, lossless=lossless, task=task)
-        source = next(logs)
+            options = DatasetOptions(state, action, task, lossless, inputs)
+            return write_dataset(logs, place, options, warn)
+        _, source = next(logs)
         if form == "images":
             return write_images(source, place)
         if form in NUMBERS:
@@ -97,35 +111,53 @@ def export(
         return write_videos(source, place, lossless=lossless)
 
 
+def _episode_logs(paths: list[Path]) -> list[list[Path]]:
+    """Return the logs that are episodes of their own: recordings, and logs that share topics."""
+    if all(path.is_dir() and is_recording([str(path)]) for path in paths):
+        return [[path] for path in paths]
+    logs = image_logs(paths)
+    topics = [log_topics(log).keys() for log in logs]
+    with contextlib.suppress(SeveralRecordingsError):
+        if len(logs) == 1 or is_recording([str(path) for path in paths]):
+            return [paths]
+    share = all(topics[0] & each for each in topics)
+    return [[log] for log in logs] if share else [paths]
+
+
 def _opened(
     paths: list[Path],
     form: str,
-    inputs: InputOptions | None,
+    inputs: InputOptions,
     about: Announce,
     warn: Callable[[str], None],
     *,
     single: bool,
-) -> Generator[LoggedSource]:
-    """Yield each log, open until the next one.
+) -> Generator[tuple[Sequence[Path], LoggedSource]]:
+    """Yield the paths of each log and its source, open until the next one.
 
     Raises:
         UsageError: its frames do not fit the form or differ from the first log, or as for
             `open_for_viewing`.
         LogDamagedError: one is damaged.
     """
-    separate = form == "lerobot" and all(p.is_dir() and is_recording([str(p)]) for p in paths)
     first = None
-    for log in [[path] for path in paths] if separate else [paths]:
-        with contextlib.closing(open_for_viewing(log, inputs)) as source:
+    for log in _episode_logs(paths) if form == "lerobot" else [paths]:
+        # Numbers of tables beside images are put at the times of the images.
+        images = [path for path in log if log_format(path) != "table"] if form == "lerobot" else log
+        if (inputs.rate or inputs.size) and is_recording([str(path) for path in log]):
+            inputs = replace(inputs, topics=inputs.topics or ALL)  # not frame by frame
+        with contextlib.closing(open_for_viewing(images or log, inputs)) as source:
             spec, why, count = source.spec, "", len(source.spec.streams)
             first = first or spec
-            if form not in ("lerobot", *NUMBERS) and not spec.images:
+            if form not in ("lerobot", *NUMBERS) and any(
+                len(shape) < 2 for shape, _ in spec.every_kind
+            ):
                 topics = topics_of(source, images=True)
                 how = f"choose images with {topics}, or use" if topics else "use --to parquet or"
                 why = f"has streams of numbers: {how} --to lerobot"
             elif single and count > 1:
                 why = f"has {count} streams: choose a folder instead of one .{form} file"
-            for name in ("streams", "frame_shape", "dtype", "truth", "fps"):
+            for name in ("streams", "frame_shape", "dtype", "kinds", "truth", "fps"):
                 if (a := getattr(first, name)) != (b := getattr(spec, name)):
                     why = f"has {name} {b}, but {paths[0]} has {a}: export them separately"
             if why:
@@ -136,7 +168,7 @@ def _opened(
             else:
                 about(source)
             try:
-                yield source
+                yield log, source
             finally:
                 for line in (*source.changes.values(), *source.skipped_damage()):
                     warn(line)

@@ -1,4 +1,4 @@
-"""Recordings as a LeRobot dataset, layout v3.0: streams of images as videos, episodes without gaps.
+"""Logs as a LeRobot dataset, layout v3.0: streams of images as videos, episodes without gaps.
 
 The layout is as published (github.com/huggingface/lerobot), written with PyArrow and PyAV: the
 package `lerobot` pins a Rerun older than the viewer's and cannot be installed beside it.
@@ -11,6 +11,7 @@ import contextlib
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
-from replay.export.frames import pieces, pixel_format, shared_spans, write_video
+from recorder.images.options import IMAGES, InputOptions
+from replay.export.frames import image_shape, pieces, pixel_format, shared_spans, write_video
+from replay.export.numbers import ACTIONS, READ, STATE, Columns, Message, log_columns
+from replay.export.statistics import ImageStats, number_stats
 from replay.logs.formats.lerobot_layout import Stats, table_of_tasks, write_stats
+from replay.logs.open_logs import log_format
 from replay.logs.source import LoggedSource
 from replay.stored_source import Span
 
@@ -32,33 +36,51 @@ FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 # LeRobot's limit for files in a folder. Each log is one video a stream; numbers are one table.
 FILES = 1000
 
-# LeRobot's names of actions, of the state of a robot or an agent, and of other ground truth.
-ACTIONS, STATE, WORLD = "action", "observation.state", "observation.environment_state"
+# LeRobot's name of ground truth that is no state of a robot or an agent.
+WORLD = "observation.environment_state"
 
-QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
-# Values (n,) or (n, k) of each feature, and the names of its k numbers.
-Columns = dict[str, tuple[NDArray[Any], list[str] | None]]
+@dataclass(frozen=True, slots=True)
+class DatasetOptions:
+    """Content of a dataset.
+
+    Attributes:
+        state: topics or TOPIC:FIELD of `observation.state`; empty for joint states.
+        action: the same of `action`; empty for joint states on topics of commands.
+        task: description of the task; None for that of each log.
+        lossless: keep every pixel.
+        inputs: options of logs.
+    """
+
+    state: Sequence[str] = ()
+    action: Sequence[str] = ()
+    task: str | None = None
+    lossless: bool = False
+    inputs: InputOptions = IMAGES
 
 
 def write_dataset(
-    logs: Iterable[LoggedSource], folder: Path, *, lossless: bool, task: str | None = None
+    logs: Iterable[tuple[Sequence[Path], LoggedSource]],
+    folder: Path,
+    options: DatasetOptions,
+    warn: Message,
 ) -> int:
-    """Write recordings as a LeRobot dataset, and return its number of frames.
+    """Write logs as a LeRobot dataset, and return its number of frames.
 
-    An episode is a stretch of frames that every stream has; it ends where an episode of a recorded
-    task ends. Images become videos `observation.images.STREAM`, numbers `observation.STREAM`, and
-    ground truth `action`, `observation.state` and `observation.environment_state`, all float32.
+    An episode is a stretch of frames that every camera has; it ends where an episode of a recorded
+    task ends. Images become videos `observation.images.STREAM`, numbers the features that
+    `log_columns` states, and ground truth `action`, `observation.state` and
+    `observation.environment_state`, all float32. Each log is read once for every stream.
 
     Args:
-        logs: logs with equal streams, shapes and rates, each open until the next one.
+        logs: the paths and the source of logs with equal streams, each open until the next one.
         folder: the new folder.
-        lossless: keep every pixel.
-        task: description of the task; by default that of each log.
+        options: content of the dataset.
+        warn: called with a line for everything that it does not hold.
 
     Raises:
-        UsageError: no frame is in every stream, the frame rate is not a whole number, or PyAV is
-            not installed.
+        UsageError: no frame is in every stream, the frame rate is not a whole number, the logs
+            have different numbers, or PyAV is not installed.
         CdmisfaError: a file cannot be written.
     """
     features: dict[str, dict[str, Any]] = {}
@@ -67,56 +89,83 @@ def write_dataset(
     fps = start = 0
     with contextlib.ExitStack() as stack:
         table: pq.ParquetWriter | None = None
-        for log, source in enumerate(logs):
-            fps, spans = _whole_rate(source.spec), _episodes(source)
-            name = task or _task(source)
+        for log, (paths, source) in enumerate(logs):
+            fps, spans = _whole_rate(source), _episodes(source)
+            name = options.task or _task(source)
             number = tasks.setdefault(name, len(tasks))
-            columns = _numbers(source, spans) | _clock(spans, fps, start, len(episodes), number)
+            columns = _numbers(source, paths, spans, options, warn)
+            columns |= _clock(spans, fps, start, len(episodes), number)
+            _refuse_other(features, columns, paths[0])
             features |= {key: _feature(*column) for key, column in columns.items()}
-            ends = list(itertools.accumulate((high - low for low, high in spans), initial=0))
-            rows: list[dict[str, Any]] = [
-                {
-                    "episode_index": len(episodes) + i,
-                    "tasks": [name],
-                    "length": end - begin,
-                    **_file_number("data", 0),
-                    "dataset_from_index": start + begin,
-                    "dataset_to_index": start + end,
-                    "stats": {k: number_stats(v[begin:end]) for k, (v, _) in columns.items()},
-                }
-                for i, (begin, end) in enumerate(itertools.pairwise(ends))
-            ]
+            rows = _rows(columns, spans, start, len(episodes), name)
             for stream, view in enumerate(stream_names(source.spec.streams)):
-                if not source.spec.of(stream).images:
-                    continue
-                key = f"observation.images.{view}"
-                features[key] = _video_feature(source.spec.kind(stream)[0], fps)
-                file = _path(folder / "videos" / key, log, "mp4")
-                write_video(source, stream, file, lossless=lossless, spans=spans)
-                for row, span in zip(rows, spans, strict=True):
-                    row |= _file_number(f"videos/{key}", log)
-                    for edge in ("from", "to"):
-                        frame = row[f"dataset_{edge}_index"] - start
-                        row[f"videos/{key}/{edge}_timestamp"] = frame / fps
-                    row["stats"][key] = image_stats(source, stream, span)
+                if len(source.spec.kind(stream)[0]) > 1:
+                    key = f"observation.images.{view}"
+                    features[key] = _video_feature(source, stream, fps, lossless=options.lossless)
+                    file = _path(folder / "videos" / key, log, "mp4")
+                    stats = [ImageStats() for _ in spans]
+                    write_video(
+                        source, stream, file, lossless=options.lossless, spans=spans, stats=stats
+                    )
+                    for row, of_images in zip(rows, stats, strict=True):
+                        row |= _file_number(f"videos/{key}", log)
+                        for edge in ("from", "to"):
+                            frame = row[f"dataset_{edge}_index"] - start
+                            row[f"videos/{key}/{edge}_timestamp"] = frame / fps
+                        row["stats"][key] = of_images.result()
             arrow = _table(columns)
             if table is None:
                 file = _path(folder / "data", 0, "parquet")
                 table = stack.enter_context(pq.ParquetWriter(file, arrow.schema))
             table.write_table(arrow)
             episodes += rows
-            start += ends[-1]
+            start = rows[-1]["dataset_to_index"]
     _write_meta(folder / "meta", episodes, tasks, features, fps)
     return start
 
 
-def _whole_rate(spec: SourceSpec) -> int:
-    if spec.fps != round(spec.fps) or spec.fps < 1:
+def _rows(
+    columns: Columns, spans: Sequence[Span], start: int, first: int, task: str
+) -> list[dict[str, Any]]:
+    """Return the rows of the table of episodes, without their videos."""
+    ends = itertools.accumulate((high - low for low, high in spans), initial=0)
+    return [
+        {
+            "episode_index": first + i,
+            "tasks": [task],
+            "length": end - begin,
+            **_file_number("data", 0),
+            "dataset_from_index": start + begin,
+            "dataset_to_index": start + end,
+            "stats": {k: number_stats(v[begin:end]) for k, (v, _) in columns.items()},
+        }
+        for i, (begin, end) in enumerate(itertools.pairwise(ends))
+    ]
+
+
+def _refuse_other(features: Mapping[str, Mapping[str, Any]], columns: Columns, path: Path) -> None:
+    """Refuse a log with other numbers than the logs before."""
+    for key in features.keys() | columns.keys() if features else ():
+        if features.get(key, {}).get("dtype") == "video":
+            continue
+        one = features[key]["shape"] if key in features else "nothing"
+        two = _feature(*columns[key])["shape"] if key in columns else "nothing"
+        if one != two:
+            raise UsageError(
+                f"{path} has {two} for {key}, but the logs before have {one}: choose topics that "
+                "all have with --topic, --state and --action, or export them separately"
+            )
+
+
+def _whole_rate(source: LoggedSource) -> int:
+    fps = source.spec.fps
+    if fps != round(fps) or fps < 1:
+        rate = max(round(fps), 1)
         raise UsageError(
-            f"LeRobot needs a whole number of frames per second, not {spec.fps:g}: "
-            "resample with cdmisfa convert --rate first"
+            f"LeRobot needs a whole number of frames per second, not {fps:g}: resample with "
+            f"--rate {rate}, which shows the image nearest to each time"
         )
-    return round(spec.fps)
+    return round(fps)
 
 
 def _task(source: LoggedSource) -> str:
@@ -139,9 +188,19 @@ def _episodes(source: LoggedSource) -> list[Span]:
     return spans
 
 
-def _numbers(source: LoggedSource, spans: Sequence[Span]) -> Columns:
-    """Return ground truth and frames that are no images, as float32."""
+def _numbers(
+    source: LoggedSource,
+    paths: Sequence[Path],
+    spans: Sequence[Span],
+    options: DatasetOptions,
+    warn: Message,
+) -> Columns:
+    """Return the numbers of a log and its ground truth, as float32."""
     spec, columns = source.spec, Columns()
+    if not source.recorded:
+        times = np.concatenate([spec.times(*span) for span in spans])
+        chosen = {STATE: options.state, ACTIONS: options.action}
+        columns |= log_columns(source, paths, times, options.inputs, chosen, warn)
     if spec.truth:
         truth = np.concatenate([block.truth for block in pieces(source, 0, spans)])
         of_task = any(name.startswith(BEGINS) for name in spec.truth)
@@ -155,7 +214,8 @@ def _numbers(source: LoggedSource, spans: Sequence[Span]) -> Columns:
         for key, group in groups.items():
             columns[key] = truth[:, group], [spec.truth[i] for i in group]
     for stream, name in enumerate(stream_names(spec.streams)):
-        if spec.of(stream).images:
+        read = not source.recorded and log_format(source.streams[stream].path) in READ
+        if len(spec.kind(stream)[0]) > 1 or read:
             continue
         frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
         columns[f"observation.{name}"] = frames, [f"x{i + 1}" for i in range(frames.shape[1])]
@@ -183,8 +243,10 @@ def _feature(values: NDArray[Any], names: list[str] | None) -> dict[str, Any]:
     return {"dtype": str(values.dtype), "shape": list(values.shape[1:]) or [1], "names": names}
 
 
-def _video_feature(shape: tuple[int, ...], fps: int) -> dict[str, Any]:
-    height, width = shape
+def _video_feature(
+    source: LoggedSource, stream: int, fps: int, *, lossless: bool
+) -> dict[str, Any]:
+    height, width, channels = image_shape(source, stream)
     return {
         "dtype": "video",
         "shape": [height, width, 3],
@@ -193,7 +255,7 @@ def _video_feature(shape: tuple[int, ...], fps: int) -> dict[str, Any]:
             "video.height": height,
             "video.width": width,
             "video.codec": "h264",
-            "video.pix_fmt": pixel_format(shape),
+            "video.pix_fmt": pixel_format((height, width, channels), lossless=lossless),
             "video.is_depth_map": False,
             "video.fps": fps,
             "video.channels": 3,
@@ -255,34 +317,3 @@ def _write_meta(
     }
     (meta / "info.json").write_text(json.dumps(info, indent=4), "utf-8")
     write_stats(meta / "stats.json", {key: [part[key] for part in stats] for key in features})
-
-
-def number_stats(values: NDArray[Any]) -> Stats:
-    """Return LeRobot's statistics of (n,) or (n, k) numbers."""
-    rows = values.astype(np.float64).reshape(len(values), -1)
-    return {
-        "min": rows.min(axis=0),
-        "max": rows.max(axis=0),
-        "mean": rows.mean(axis=0),
-        "std": rows.std(axis=0),
-        "count": np.array([len(rows)]),
-        **{key: np.quantile(rows, q, axis=0) for key, q in QUANTILES.items()},
-    }
-
-
-def image_stats(source: LoggedSource, stream: int, span: Span) -> Stats:
-    """Return LeRobot's statistics of pixels from 0 to 1, (3, 1, 1) each, from a histogram."""
-    counts = np.zeros(256, dtype=np.int64)
-    for block in pieces(source, stream, [span]):
-        counts += np.bincount(block.frames.reshape(-1), minlength=256)
-    levels, total, below = np.arange(256) / 255, counts.sum(), np.cumsum(counts)
-    mean = (levels * counts).sum() / total
-    values = {
-        "min": levels[counts > 0][0],
-        "max": levels[counts > 0][-1],
-        "mean": mean,
-        "std": np.sqrt(((levels - mean) ** 2 * counts).sum() / total),
-        **{key: levels[np.searchsorted(below, q * total)] for key, q in QUANTILES.items()},
-    }
-    stats = {key: np.full((3, 1, 1), value) for key, value in values.items()}
-    return {**stats, "count": np.array([span[1] - span[0]])}

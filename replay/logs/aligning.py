@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from replay.logs.clock import FrameClock
 from replay.logs.formats.arrays import FPS
 from replay.logs.formats.table import TIME_NAMES, UNITS
 from replay.logs.stream import LogStream, joined
+
+# Share by which a measured rate may differ from the whole number that is meant: clocks of cameras.
+DRIFT: Final = 1e-4
 
 
 class UnequalError(UsageError):
@@ -53,8 +57,11 @@ def align(
         streams = [_excerpt(stream, options, zero) for stream in streams]
     times = list(map(_times, streams))
     by_index = arrays or (options.align == "index" and len(times) > 1)
-    if options.align == "time":
-        return streams, fps, clocks.by_time(times, fps)
+    if options.align == "nearest" and abs(fps - round(fps)) <= DRIFT * fps:
+        fps = float(round(fps))
+    if options.align in ("time", "nearest"):
+        nearest = options.align == "nearest"
+        return streams, fps, clocks.by_time(times, fps, nearest=nearest)
     if not by_index:
         _refuse_unequal(streams, times, fps)
     return streams, fps, clocks.by_index(times, fps, gaps=not by_index)

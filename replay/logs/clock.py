@@ -50,8 +50,13 @@ class FrameClock:
     first: int = 0
 
 
-def by_time(streams: Sequence[IntArray], fps: float) -> FrameClock:
+def by_time(streams: Sequence[IntArray], fps: float, *, nearest: bool = False) -> FrameClock:
     """Show in each frame the last row at or before its time, while every stream has rows.
+
+    Args:
+        streams: the times of each.
+        fps: frames a second.
+        nearest: show the nearest row, so that jitter of a camera repeats no image.
 
     Raises:
         UsageError: the streams do not overlap, or there are more than `MAX_FRAMES` frames.
@@ -59,10 +64,11 @@ def by_time(streams: Sequence[IntArray], fps: float) -> FrameClock:
     start, stop = overlap(streams)
     if stop < start:
         raise UsageError("the streams do not overlap in time: choose one with --topic")
-    ticks = (stop - start) * fps / NANOSECONDS + 1
+    ticks = (stop - start) * fps / NANOSECONDS + (1.5 if nearest else 1)
     _refuse_many(ticks)
     clock = times_of(np.arange(int(ticks)), fps, start)
-    rows = [np.searchsorted(times, clock, side="right") - 1 for times in streams]
+    row_at = nearest_rows if nearest else last_rows
+    rows = [row_at(times, clock) for times in streams]
     gaps: list[list[Span]] = []
     for times in streams:
         step, spans = step_of(times) * NANOSECONDS, list[Span]()
@@ -73,6 +79,16 @@ def by_time(streams: Sequence[IntArray], fps: float) -> FrameClock:
                 spans.append((begins, ends))
         gaps.append(spans)
     return FrameClock(start, rows, gaps)
+
+
+def last_rows(times: IntArray, clock: IntArray) -> IntArray:
+    """Return the last row at or before each time of a clock."""
+    return np.searchsorted(times, clock, side="right") - 1
+
+
+def nearest_rows(times: IntArray, clock: IntArray) -> IntArray:
+    """Return the row nearest to each time of a clock, the earlier one of two."""
+    return np.searchsorted(times[:-1] + np.diff(times) // 2, clock)
 
 
 def by_index(streams: Sequence[IntArray], fps: float, *, gaps: bool) -> FrameClock:

@@ -131,7 +131,9 @@ class LoggedSource(StoredSource):
                 if how.range and HIGH_BYTE in lines:
                     here = f"{self.streams[i].path}: {self.streams[i].topic}"
                     raise UsageError(f"{here} has no distances for input.range: {TO_8_BITS}")
-            self.framings = made = framings(firsts, how.size, how.fit, color=self.color)
+            self.framings = made = framings(
+                firsts, how.size, how.fit, color=self.color, native=how.native
+            )
             kinds = [framing.kind for framing in made]
             self._spec = SourceSpec.of_kinds(names, kinds, (), self._fps, clock.start_ns, length)
             for i, rows in enumerate(clock.rows):  # refused before anything is written

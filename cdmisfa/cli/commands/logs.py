@@ -1,4 +1,4 @@
-"""`cdmisfa info`, `verify`, `recover`, `export` and `index`: logs, recordings and runs as files."""
+"""`cdmisfa info`, `verify`, `recover` and `index`: logs, recordings and runs as files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from cdmisfa.core.names import counted, duration_text
 if TYPE_CHECKING:
     from replay.corpus.index import Indexed
     from replay.integrity.report import LogReport, SizeInfo
-    from replay.logs.source import LoggedSource
 
 # Largest number of streams of a run that `info` names, to keep them on one line.
 MOST_STREAMS = 8
@@ -241,83 +240,6 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
             printing.status(f"{mended.where}: {mended.what}")
         printing.line(f"repaired {'dataset' if output.is_dir() else 'file'} written to {output}")
     return 0 if recovery.complete else LogDamagedError.exit_code
-
-
-@options.command("export")
-@options.log_argument("path")
-@options.option("--to FORMAT", name="form")
-@options.output("File or folder to write.", required=True)
-@options.option("--lossless")
-@options.option("--task TEXT")
-@options.inputs("topics", "fields", "rate", "settings")
-@options.force
-@options.as_json
-def export_command(
-    path: tuple[Path, ...],
-    form: str | None,
-    output: Path,
-    lossless: bool,
-    as_json: bool,
-    **arguments: Any,
-) -> None:
-    """Export signals or numbers as tables, or images and videos.
-
-    The signals of a run (the values that the learner computed) go to one Parquet, CSV or NumPy
-    file; CSV leaves out the outputs of single frames (y, y_frozen). The numbers of logs (--field)
-    go to one Parquet or CSV file for each stream, with a row for each message: log_time (ns) and
-    the fields. Recordings and logs go to a folder of PNG files, to one MP4 file for each stream,
-    or to a LeRobot dataset v3.0, in which each recording is an episode.
-
-    PATH is one of:
-        {run}
-        {recording}
-        {logs}
-        {url}
-
-    Options:
-        --topic TOPIC: Read this topic of a log, or all that match a pattern such as '/cam*'; each
-            becomes a stream. Repeatable. [default: all with images]
-        --to FORMAT: Format to write: parquet, csv, npz, images, mp4 or lerobot. [default: the
-            ending of -o]
-        --lossless: Encode videos without changing any pixel; they become larger.
-        --task TEXT: Task that a LeRobot dataset names for its episodes. [default: as the log
-            states]
-
-    Examples:
-        cdmisfa export runs/kitchen -o signals.parquet
-        cdmisfa export robot.mcap --field position -o joints.parquet
-        cdmisfa export monday.mcap tuesday.mcap --to lerobot --lossless -o dataset
-    """
-    from replay.export.formats import export
-    from replay.export.tables import CSV_LEAVES_OUT, TABLES
-    from replay.open_sources import holds_run
-
-    form = form or output.suffix.removeprefix(".")
-    warnings: list[str] = []
-
-    def warn(text: str) -> None:
-        printing.warning(text)
-        warnings.append(text)
-
-    def about(source: LoggedSource) -> None:
-        printing.source(source)
-        warnings.extend(source.warnings)
-
-    rows = export(path, output, form, lossless=lossless, about=about, warn=warn, **arguments)
-    of_run = form in TABLES and holds_run(path[0])
-    if form == "csv" and of_run:
-        printing.status(f"CSV leaves out {' and '.join(CSV_LEAVES_OUT)}: Parquet and npz have them")
-    videos = output.is_file() or next(output.rglob("*.mp4"), None) is not None
-    if form in ("mp4", "lerobot") and videos and not lossless:
-        printing.status("H.264 changes pixels a little: --lossless keeps every pixel")
-    if as_json:
-        printing.document(
-            path=" ".join(map(str, path)), file=str(output), rows=rows, warnings=warnings
-        )
-        return
-    unit = "iterations" if of_run else "messages" if form in TABLES else "frames"
-    unit = "images" if form == "images" else unit
-    printing.line(f"{rows} {unit} written to {output}")
 
 
 @options.command("index")

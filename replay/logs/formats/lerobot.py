@@ -40,7 +40,7 @@ V21: Final = "meta/episodes.jsonl"
 _IMAGES: Final = ("video", "image")
 
 # Features that number the frames.
-_CLOCK: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+CLOCK: Final = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 
 
 class Dataset:
@@ -87,7 +87,7 @@ def streams(
     chosen = [c for c in cameras if (fits_topic(c, topics) if topics else not fields)]
     numbers: dict[str, tuple[str, ...]] = {n: (n,) for n in numeric if n in topics}
     if not (cameras or topics or fields):
-        fields = tuple(topic for topic in numeric if topic not in _CLOCK)
+        fields = tuple(topic for topic in numeric if topic not in CLOCK)
     if fields and not numbers:
         if not chosen:
             check_topics(path, name, topics)
@@ -114,7 +114,7 @@ def streams(
             missing=camera.dataset.missing,
         )
         opened_streams.append(stream)
-    read = [(feature,) for feature in (*chosen, *fields, *topics, *_CLOCK)]
+    read = [(feature,) for feature in (*chosen, *fields, *topics, *CLOCK)]
     notes = left_out(path, _info(path)["features"], read, options)
     return [replace(stream, notes=notes) for stream in opened_streams]
 
