@@ -33,12 +33,12 @@ CEILINGS = {
     "replay/episodes": 1190,
     "replay/export": 1025,
     "replay/integrity": 1120,
-    "replay/logs": 3001,
+    "replay/logs": 3010,
     "replay/report": 960,
     "replay/runs": 1410,
     "replay/storage": 290,
     "replay/view": 1960,
-    "tests": 19694,
+    "tests": 19760,
     "tools": 2080,
 }
 """Code lines allowed in each package: what it had when the ceiling was set, and 5 percent."""
