@@ -1,4 +1,4 @@
-"""Run the benchmarks named on the command line, by default all but `constants`."""
+"""Run the benchmarks named on the command line, by default all but the long ones."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import benchmarks
 from benchmarks.report import write_page
 
 # Benchmarks that run only if they are named: these take half an hour or more.
-ONLY_BY_NAME = {"constants", "episodes"}
+ONLY_BY_NAME = {"constants", "dots", "episodes", "policies"}
 
 # Modules without a benchmark of their own.
-NO_BENCHMARKS = {"__main__", "arena", "paper", "report", "robot_episodes"}
+NO_BENCHMARKS = {"__main__", "arena", "paper", "report", "robot_episodes", "trajectories"}
 
 
 def main() -> None:

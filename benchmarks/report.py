@@ -155,6 +155,25 @@ PARTS = {
         "IncrementalPCA does not look for slow features.",
         (0, 1, 2, 3, 4, 5),
     ),
+    "dots": Part(
+        "A moving dot in noise",
+        "Error of the position of a dot, in image widths, read from features of one image by ridge "
+        "regression: 170 images a trajectory, 5,000 labels. Noise changes with each image, or "
+        "turns slowly or is fixed within a trajectory, as in Sobal et al. 2022 (arXiv:2211.10831) "
+        "and Gulati and Nemenman 2026 (arXiv:2606.07770). Their curves are plots without values, "
+        "so they are not in the table; the first paper reports that JEPA fails if the noise is "
+        "fixed. `within`: learned without the mean of the trajectory, applied to images as they "
+        "are. Rejected: the learner saves no module.",
+        (0, 1, 2, 3, 5, 7, 8, 9, 10, 11),
+        table=2,
+    ),
+    "policies": Part(
+        "Behaviour cloning from images",
+        "A small network imitates a demonstrator from the last two images: pixels, principal "
+        "components, batch SFA, or the outputs of a module. All are learned from the images of 200 "
+        "episodes; 10, 50 or 200 of them have actions. 0: random actions, 1: the demonstrator.",
+        (0, 1, 2, 3, 4, 5, 6),
+    ),
     "messages": Part(
         "Reading messages",
         "Topic, time and payload of every message of an MCAP log, which stores them in the order "
