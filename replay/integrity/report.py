@@ -109,7 +109,7 @@ class LogReport:
         notes: remarks that are no problems.
         size: bytes.
         library: writer of the file; "" for several writers.
-        health: of each stream of images its columns, see `Health`; `verify` measures it.
+        health: `topic` and columns of each stream of images, see `Health`; `verify` measures it.
         files: report on each file.
     """
 
@@ -130,7 +130,7 @@ class LogReport:
     notes: tuple[str, ...] = ()
     size: SizeInfo = SizeInfo()
     library: str = ""
-    health: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    health: tuple[Mapping[str, Any], ...] = ()
     files: tuple[LogReport, ...] = ()
 
     @property
@@ -182,12 +182,7 @@ class LogReport:
             "state": self.state,
             "problems": [asdict(problem) for problem in self.problems],
             "files": [
-                {
-                    "file": f.path,
-                    "crc": f.crc,
-                    "state": f.state,
-                    "streams": [{"topic": topic, **columns} for topic, columns in f.health.items()],
-                }
+                {"file": f.path, "crc": f.crc, "state": f.state, "streams": f.health}
                 for f in self.files
             ],
             "notes": self.notes,
@@ -238,11 +233,11 @@ def combined(
 
 def with_health(report: LogReport, streams: Mapping[str, Health]) -> LogReport:
     """Add the health of streams, with a note on each in which something is remarkable."""
-    health = {topic: stream.columns() for topic, stream in streams.items()}
-    remarks = {topic: stream.remark() for topic, stream in streams.items()}
-    notes = [f"{report.path}: {topic}: {text}" for topic, text in remarks.items() if text]
-    health = {topic: columns for topic, columns in health.items() if columns}
-    return replace(report, health=health, notes=(*report.notes, *notes))
+    health = [{"topic": topic, **stream.columns()} for topic, stream in streams.items()]
+    remarks = [(topic, stream.remark()) for topic, stream in streams.items()]
+    notes = [f"{report.path}: {topic}: {text}" for topic, text in remarks if text]
+    health = [columns for columns in health if len(columns) > 1]
+    return replace(report, health=tuple(health), notes=(*report.notes, *notes))
 
 
 def failed(place: str | Path, error: CdmisfaError) -> LogReport:

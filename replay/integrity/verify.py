@@ -22,14 +22,7 @@ from recorder.mcap.reader import NO_CHECKSUMS, LogReader
 from recorder.mcap.records import Problem, Segment
 from replay.integrity.info import count_decoded, kind_of, read_once, report_all, report_on
 from replay.integrity.listing import each_report
-from replay.integrity.report import (
-    LogReport,
-    State,
-    as_problem,
-    combined,
-    failed,
-    with_health,
-)
+from replay.integrity.report import LogReport, State, as_problem, combined, failed, with_health
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
 from replay.logs.formats.recording import ViewFile

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -47,7 +47,7 @@ COLUMNS: Final = ("frozen_seconds", "frozen_at", "repeated", "black", "saturated
 
 
 class Health:
-    """Measures the images of a stream as they come; holds the last two, and 32 bytes of each."""
+    """Measures the images of a stream as they come; holds the last two, and 36 bytes of each."""
 
     def __init__(self) -> None:
         self._rows, self._last = array("f"), list[NDArray[Any]]()
@@ -72,10 +72,9 @@ class Health:
         changes = [np.maximum(grid, one) - np.minimum(grid, one) for one in last] or [grid * 0]
         low, high = (1, 254) if HIGH_BYTE in lines else (BLACK, WHITE)
         counts = (changes[-1] > _FAR, grid < low, grid > high)
+        half = grid.size // 2
         for change in (changes[-1], changes[0]):
-            self._rows.extend(
-                (change.mean(), np.partition(change, half := change.size // 2, None)[half])
-            )
+            self._rows.extend((change.mean(), np.partition(change, half, None)[half]))
         self._rows.extend(np.count_nonzero(part) / grid.size for part in counts)
         self._times.append(time)
         self._last = [*last[-1:], grid]
@@ -93,22 +92,24 @@ class Health:
         pause = np.concatenate([[True], (steps > _LEAST * period) | (steps < 0)])
         changed = (again > 0) & ~pause
         limits = [_LIMITS[int(np.median(part) > 0.5)] for part in (black, white)]
-        empty = (black >= limits[0]) | (white >= limits[1])
+        empty = np.stack([black >= limits[0], white >= limits[1]])
+        far = np.where(pause, 0, far)  # the scene may have moved while nothing was recorded
         frozen, start, repeated = 0.0, None, 0
         if changed.any():
-            same = (again < _SAME * np.median(again[changed])) & ~pause & ~empty
+            same = (again < _SAME * np.median(again[changed])) & ~pause & ~empty.any(0)
             noisy = _shows_noise(change[1:], typical[1:], wider[1:], same[1:])
-            for first, stop in _runs(same):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
+            for first, stop in edges.reshape(-1, 2).tolist():
                 seconds = float(times[stop - 1] - times[first]) + period
                 is_long = seconds >= _FROZEN and stop - first >= _LEAST
-                if noisy or (is_long and _jumps(np.where(pause, 0, far), same, first, stop)):
+                if noisy or (is_long and _jumps(far, same, first, stop)):
                     repeated += stop - first
                     if is_long and seconds > frozen:
                         frozen, start = seconds, float(times[first] - times[0])
-        values = (repeated / len(times), np.mean(black >= limits[0]), np.mean(white >= limits[1]),
-                  black.mean(), white.mean())  # fmt: skip
-        rounded = (None if value is None else round(float(value), 4) for value in (start, *values))
-        return dict(zip(COLUMNS, (round(frozen, 4), *rounded), strict=True))
+        shares = [repeated / len(times), *empty.mean(1), black.mean(), white.mean()]
+        values = [frozen, start, *map(float, shares)]
+        rounded = (None if value is None else round(value, 4) for value in values)
+        return dict(zip(COLUMNS, rounded, strict=True))
 
     def remark(self) -> str:
         """Return what is remarkable about the images, or ""."""
@@ -135,12 +136,6 @@ def _shows_noise(
         return False
     alternates = np.cov(change[:-1], change[1:])[0, 1] < -0.3 * change.var()
     return bool(abs(wider[fresh].mean() / typical[fresh].mean() - 1) < 0.15 and not alternates)
-
-
-def _runs(same: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Yield runs [first, stop) of images that equal one of the two before."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def _jumps(far: FloatArray, same: NDArray[np.bool_], first: int, stop: int) -> bool:

@@ -140,8 +140,8 @@ class ViewFile:
                 rows.read(number, 0, count, frames)
                 if frames is not None:
                     for time, frame in zip(rows.times(number).tolist(), frames, strict=True):
-                        image = frame.reshape(self.facts.frame_shape)
-                        health.add(time / 1e9, functools.partial(np.asarray, image))
+                        shaped = functools.partial(frame.reshape, self.facts.frame_shape)
+                        health.add(time / 1e9, shaped)
 
     def finish(self) -> None:
         """Set `ranges`, after the last chunk."""
