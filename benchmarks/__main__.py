@@ -10,10 +10,12 @@ import benchmarks
 from benchmarks.report import write_page
 
 # Benchmarks that run only if they are named: these take half an hour or more.
-ONLY_BY_NAME = {"constants", "dots", "episodes", "policies"}
+ONLY_BY_NAME = {"constants", "dots", "episode_peers", "episodes", "policies"}
 
 # Modules without a benchmark of their own.
-NO_BENCHMARKS = {"__main__", "arena", "paper", "report", "robot_episodes", "trajectories"}
+NO_BENCHMARKS = {
+    "__main__", "arena", "paper", "report", "robot_bench", "robot_episodes", "trajectories"
+}  # fmt: skip
 
 
 def main() -> None:
