@@ -16,7 +16,9 @@ from benchmarks.report import save
 from benchmarks.robot_bench import Bench
 from benchmarks.robot_episodes import FAULTS, FPS, World, dataset, make_pool
 from cdmisfa.core.processes import run_all
-from replay.episodes.ranking import Ranked, rank_episodes
+from replay.episodes.measure import Measured
+from replay.episodes.ranking import Ranked, compare, rank_episodes
+from replay.episodes.reading import EpisodeLog
 
 SEED: Final = 7001
 """Of the episodes; no limit was set on it."""
@@ -31,6 +33,7 @@ GOOD, EACH, SECOND = 60, 2, 20
 """Good episodes of a task, episodes of each fault, and good ones of its second session."""
 
 Episode = dict[str, Any]
+Pair = tuple[EpisodeLog, Measured]
 
 
 def auroc(bad: Sequence[float], good: np.ndarray) -> float:
@@ -67,13 +70,21 @@ def listed(pool: Path, task: str) -> list[Episode]:
     return [{**row, "pool": str(pool)} for row in rows]
 
 
-def ranked(folder: Path, name: str, episodes: Sequence[Episode], rig: type[World]) -> Ranked:
-    """Assemble a dataset and rank its episodes."""
-    shutil.rmtree(folder / name, ignore_errors=True)
-    dataset(folder / name, episodes, rig.cameras)
-    result = rank_episodes([folder / name], folder / f"{name}-ranked", jobs=2)
+def measured(folder: Path, rig: type[World], task: str) -> dict[str, Pair]:
+    """Measure all episodes of a task and of its two sessions, by name."""
+    rows = [*listed(folder / "a", task), *listed(folder / "b", task)]
+    shutil.rmtree(folder / task, ignore_errors=True)
+    dataset(folder / task, rows, rig.cameras)
+    result = rank_episodes([folder / task], folder / f"{task}-ranked", jobs=2)
     assert result is not None
-    return result
+    pairs = zip(result.logs, result.measured, strict=True)
+    return {row["name"]: pair for row, pair in zip(rows, pairs, strict=True)}
+
+
+def ranked(pairs: dict[str, Pair], episodes: Sequence[Episode]) -> Ranked:
+    """Compare episodes of one dataset."""
+    logs, measures = zip(*(pairs[episode["name"]] for episode in episodes), strict=True)
+    return compare([*logs], [*measures])
 
 
 def faulty_sets(folder: Path, task: str) -> Iterator[list[Episode]]:
@@ -92,13 +103,15 @@ def faulty_sets(folder: Path, task: str) -> Iterator[list[Episode]]:
         yield [*(one for one in good if one["name"] not in bases), *part]
 
 
-def with_faults(folder: Path, rig: type[World]) -> tuple[dict[str, list[object]], list[object]]:
+def with_faults(
+    folder: Path, rig: type[World], pairs: dict[str, Pair]
+) -> tuple[dict[str, list[object]], list[object]]:
     """Rank datasets with faults; return AUROC and flagged share by fault, and totals."""
     areas, flags = defaultdict[str, list[float]](list), defaultdict[str, list[bool]](list)
     alarms, precision, late, told = list[bool](), list[float](), list[bool](), list[bool]()
     for task in rig.tasks:
-        for number, chosen in enumerate(faulty_sets(folder, task)):
-            result = ranked(folder, f"{task}{number}", chosen, rig)
+        for chosen in faulty_sets(folder, task):
+            result = ranked(pairs, chosen)
             is_good = np.array([not episode["fault"] for episode in chosen])
             score = result.score
             alarms += (score[is_good] >= 1).tolist()
@@ -125,7 +138,9 @@ def with_faults(folder: Path, rig: type[World]) -> tuple[dict[str, list[object]]
     return rows, [*total, f"{np.mean(late):.1%}", f"{1 - np.mean(told):.1%}"]
 
 
-def without_faults(folder: Path, rig: type[World]) -> dict[str, list[object]]:
+def without_faults(
+    folder: Path, rig: type[World], pairs: dict[str, Pair]
+) -> dict[str, list[object]]:
     """Rank good datasets: small ones, two sessions, two tasks; return the share that is flagged."""
     kinds = defaultdict[str, list[list[Episode]]](list)
     good = {
@@ -140,16 +155,10 @@ def without_faults(folder: Path, rig: type[World]) -> dict[str, list[object]]:
             kinds[f"{size} of one session"].append([first[i] for i in order[:size]])
         kinds["two sessions"] += [[*first[:20], *second[:6]], [*first[:14], *second[:14]]]
         other = good["a", rig.tasks[place - 1]]
-        kinds["two tasks"].append([{**one, "label": "task"} for one in [*first[:18], *other[:9]]])
+        kinds["two tasks"].append([*first[:18], *other[:9]])
     rows = {}
     for kind, sets in kinds.items():
-        flagged = [
-            bool(score >= 1)
-            for place, chosen in enumerate(sets)
-            for score in ranked(
-                folder, f"{rig.__name__}-{kind.replace(' ', '-')}{place}", chosen, rig
-            ).score
-        ]
+        flagged = [score >= 1 for chosen in sets for score in ranked(pairs, chosen).score]
         rows[kind] = [len(flagged), f"{np.mean(flagged):.1%}"]
     return rows
 
@@ -162,10 +171,11 @@ def main(*, quick: bool = False) -> None:
     names = {Bench: "bench", World: "Kuka"}
     faults, totals, good = list[dict[str, list[object]]](), list[list[object]](), []
     for rig in rigs:
-        rows, total = with_faults(folder, rig)
+        pairs = {k: v for task in rig.tasks for k, v in measured(folder, rig, task).items()}
+        rows, total = with_faults(folder, rig, pairs)
         faults.append(rows)
         totals.append([names[rig], *total])
-        good.append(without_faults(folder, rig))
+        good.append(without_faults(folder, rig, pairs))
         print(totals[-1], rows, good[-1], flush=True)
     each = ["episodes", "AUROC", "flagged"]
     save(
