@@ -199,6 +199,20 @@ PARTS = {
         "Recordings of three views with 1,000 frames each, two processes.",
         (0, 1, 3, 4),
     ),
+    "episodes": Part(
+        "Bad episodes of a robot dataset",
+        "Simulated episodes with planted faults, two cameras, AV1-coded as LeRobot does; about a "
+        "sixth of a dataset is faulty. AUROC is the probability that a faulty episode has a higher "
+        "score than a good one of its dataset. The limits of `cdmisfa episodes` were not set on "
+        "this arm, its tasks, its wrist camera or this seed.",
+        (0, 1, 2, 3),
+        table=1,
+    ),
+    "episode_peers": Part(
+        "Bad episodes: other tools",
+        "AUROC on datasets with one episode of each fault: each tool with all of its checks.",
+        (0, 1, 2, 3, 4, 5),
+    ),
     "long_recordings": Part(
         "Memory for long recordings",
         "Peak memory of a process, Python and its libraries included, for a short and a long "

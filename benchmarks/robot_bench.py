@@ -1,4 +1,4 @@
-"""Other simulated episodes: a slender arm of six joints, a wrist camera, three other tasks.
+"""Other simulated episodes: a slender arm of six joints, a wrist camera, two other tasks.
 
 No limit of `cdmisfa episodes` was set on them.
 """
@@ -46,7 +46,7 @@ def arm_urdf() -> str:
 class Bench(World):
     """A bench with a slender arm, seen from the side and from its wrist."""
 
-    tasks: ClassVar[tuple[str, ...]] = ("stir", "shelf", "tour")
+    tasks: ClassVar[tuple[str, ...]] = ("stir", "shelf")
     cameras: ClassVar[tuple[str, str]] = ("side", "wrist")
     home: ClassVar[Sequence[float]] = (0, 0.2, 1.6, 0, 1.34, 0)
 
@@ -94,7 +94,7 @@ class Bench(World):
             ring = a + miss + up * 0.05 + rng.uniform(0.03, 0.045) * turns
             plan = [(ring[0] + up * 0.15, 0, 1.1), (ring[0], 0, 0.7), *((r, 0, 0.16) for r in ring)]
             plan += [(ring[-1] + up * 0.14, 0, 0.6), (start, 0, 0.9)]
-        elif self.task == "shelf":
+        else:
             if not missing:
                 color = [0.75, 0.7, 0.7] if wrong else [0.15, 0.65, 0.25]
                 carried = self._box([0.025, 0.025, 0.045], a + up * 0.045, color, 0.05)
@@ -104,17 +104,4 @@ class Bench(World):
             plan = [(grip + up * 0.1, 0, 1.0), (grip, 0, 0.7), (grip, 1, 0.3),
                     (grip + up * 0.2, 1, 0.9), (drop + up * 0.1, 1, 1.3), (drop, 1, 0.5),
                     (drop, 0, 0.3), (drop + up * 0.1, 0, 0.5), (start, 0, 1.1)]  # fmt: skip
-        else:
-            plan, places = [], [np.array([rng.uniform(0.32, 0.5), y + rng.uniform(-0.05, 0.05), 0])
-                                for y in rng.permutation([-0.22, 0, 0.22])]  # fmt: skip
-            colors = [[0.8, 0.15, 0.15], [0.15, 0.3, 0.8], [0.9, 0.8, 0.2]]
-            odd = rng.integers(3)
-            for k, (place, color) in enumerate(zip(places, colors, strict=True)):
-                if not (missing and k == odd):
-                    shade = [0.1, 0.1, 0.1] if wrong and k == odd else color
-                    self.things.append(self._box([0.02, 0.02, 0.03], place + up * 0.03, shade))
-                goal = place + up * 0.11
-                if not (fault == "fail" and k == odd):
-                    plan += [(goal + up * 0.1, 0, 0.9), (goal, 0, 0.5), (goal + up * 0.1, 0, 0.4)]
-            plan.append((start, 0, 1.0))
         return plan, carried

@@ -328,24 +328,19 @@ def dataset(out: Path, episodes: Sequence[dict[str, Any]], cameras: Sequence[str
         }  # fmt: skip
         pq.write_table(pa.table(table), out / f"data/chunk-000/{name}.parquet")
         for camera in cameras:
-            video = out / f"videos/observation.images.{camera}/{name}.mp4"
+            video = out / f"videos/chunk-000/observation.images.{camera}/{name}.mp4"
             video.parent.mkdir(parents=True, exist_ok=True)
             os.link(place / f"{episode['name']}.{camera}.mp4", video)
-        lines.append(
-            {
-                "episode_index": number,
-                "tasks": ["a task"],
-                "length": count,
-            }
-        )
+        lines.append({"episode_index": number, "tasks": ["a task"], "length": count})
         total += count
     numbers_feature = {"dtype": "float32", "shape": [state.shape[1]], "names": None}
+    name = "episode_{episode_index:06d}"
     video_feature = {"dtype": "video", "shape": [HEIGHT, WIDTH, 3], "names": None}
     info = {
         "codebase_version": "v2.1", "robot_type": "simulated", "total_episodes": len(lines),
         "total_frames": total, "total_tasks": 1, "chunks_size": 1000, "fps": FPS,
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": "videos/{video_key}/episode_{episode_index:06d}.mp4",
+        "data_path": f"data/chunk-{{episode_chunk:03d}}/{name}.parquet",
+        "video_path": f"videos/chunk-{{episode_chunk:03d}}/{{video_key}}/{name}.mp4",
         "features": {"observation.state": numbers_feature, "action": numbers_feature}
         | {f"observation.images.{camera}": video_feature for camera in cameras},
     }  # fmt: skip
