@@ -201,10 +201,9 @@ PARTS = {
     ),
     "episodes": Part(
         "Bad episodes of a robot dataset",
-        "Simulated episodes with planted faults, two cameras, AV1-coded as LeRobot does; about a "
-        "sixth of a dataset is faulty. AUROC is the probability that a faulty episode has a higher "
-        "score than a good one of its dataset. The limits of `cdmisfa episodes` were not set on "
-        "this arm, its tasks, its wrist camera or this seed.",
+        "Simulated episodes with planted faults, two cameras, AV1-coded; AUROC is the probability "
+        "that a faulty episode has a higher score than a good one of its dataset. No limit of "
+        "`cdmisfa episodes` was set on this arm, its tasks, its wrist camera or this seed.",
         (0, 1, 2, 3),
         table=1,
     ),
