@@ -62,10 +62,13 @@ def judge(tool: str, data: Path, count: int) -> list[float] | None:
     program = Path(os.environ.get("EPISODE_PEERS", "")) / "bin" / words[0]
     if not program.exists():
         return print(f"{tool}: no {program}")
-    result = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)
+    errors = ""
+    if not out.exists():
+        result = subprocess.run([program, *words[1:]], capture_output=True, text=True, check=False)
+        errors = result.stderr[-500:]
     scores = badness(json.loads(out.read_text())) if out.exists() else []
     if len(scores) != count:
-        return print(f"{tool}: {len(scores)} of {count} episodes: {result.stderr[-500:]}")
+        return print(f"{tool}: {len(scores)} of {count} episodes: {errors}")
     return scores
 
 
