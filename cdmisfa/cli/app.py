@@ -87,8 +87,7 @@ class LazyGroup(click.Group):
 @click.group(
     cls=LazyGroup,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="\b\ncdmisfa COMMAND --help lists options and examples. Exit codes:\n"
-    "0 success, 1 failure, 2 wrong usage, 3 damaged log, 4 results differ.",
+    epilog="Exit codes: 0 success, 1 failure, 2 wrong usage, 3 damaged log, 4 differs.",
 )
 @quiet
 @click.version_option(package_name="cdmisfa", message="cdmisfa %(version)s")

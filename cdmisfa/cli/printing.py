@@ -109,7 +109,8 @@ def source(frames: FrameSource) -> None:
         warning(text)
     for note in notes_of(frames):
         status(note)
-    unit = "images" if frames.spec.images else "messages"
+    kinds = {frames.spec.kind(i)[1] for i in range(len(frames.spec.streams))}
+    unit = "images" if kinds == {"uint8"} else "messages"
     for name, counts in getattr(frames, "alignment", {}).items():
         status(
             f"{name}: {counts['messages']} {unit}, {counts['repeated']} frames repeated, "
@@ -125,7 +126,8 @@ def source_changes(frames: FrameSource) -> None:
         for text in warnings_of(frames)[len(getattr(frames, "warnings", ())) :]:
             warning(text)
         return
-    unit = "images" if frames.spec.images else "messages"
+    kinds = {frames.spec.kind(i)[1] for i in range(len(frames.spec.streams))}
+    unit = "images" if kinds == {"uint8"} else "messages"
     for name, counts in getattr(frames, "alignment", {}).items():
         status(
             f"{name}: {counts['messages']} {unit}; frames: {counts['repeated']} repeated, "

@@ -38,7 +38,7 @@ def episodes_command(
     jobs: int | None,
     as_json: bool,
 ) -> int:
-    """Find bad episodes of a robot dataset, and say why they are bad.
+    """Find bad episodes of a robot dataset, and say why.
 
     The command measures every image and all joint states of each episode and compares the episodes
     with each other: frozen, black or blurred images, a moved camera, a camera that lags behind the
@@ -48,7 +48,7 @@ def episodes_command(
 
     DATASET is one of:
         datasets/pick         a LeRobot dataset
-        takes                 a folder in which each log is an episode: MCAP, ROS bag, video
+        takes                 a folder of logs, each an episode: MCAP, bag, video
         'takes/*.mcap'        a file, or a pattern that names several
 
     Options:
@@ -63,7 +63,7 @@ def episodes_command(
     Examples:
         cdmisfa episodes datasets/pick -o check
         cdmisfa episodes takes -o check --by folder
-        cdmisfa episodes 'takes/*.mcap' -o check --state /arm/joints --action /arm/command:data
+        cdmisfa episodes takes -o check --state /arm/joints --action /arm/cmd
     """
     from replay.episodes.ranking import rank_episodes
     from replay.episodes.results import PAGE, TABLE, write_ranking

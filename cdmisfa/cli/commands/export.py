@@ -66,9 +66,8 @@ def export_command(
 
     Examples:
         cdmisfa export runs/kitchen -o signals.parquet
-        cdmisfa export robot.mcap --field position -o joints.parquet
         cdmisfa export monday.mcap tuesday.mcap --to lerobot --rate 30 -o dataset
-        cdmisfa export take.mcap --state /joints --action /cmd:data --to lerobot -o dataset
+        cdmisfa export take.mcap --to lerobot --state /joints --action /cmd:data -o d
     """
     from replay.export.formats import export
     from replay.export.tables import CSV_LEAVES_OUT, TABLES

@@ -221,7 +221,6 @@ def recover_command(path: str, output: Path, force: bool, as_json: bool) -> int:
     Examples:
         cdmisfa recover left.mcap -o left-repaired.mcap
         cdmisfa recover datasets/pick -o datasets/pick-whole
-        cdmisfa recover runs/kitchen/run.mcap -o repaired/run.mcap
         cdmisfa recover https://example.org/left.mcap -o left.mcap --json
     """
     from replay.integrity.recover import recover_log
