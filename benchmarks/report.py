@@ -209,7 +209,7 @@ PARTS = {
     ),
     "episode_peers": Part(
         "Bad episodes: other tools",
-        "AUROC on datasets with one episode of each fault: each tool with all of its checks.",
+        "AUROC on two datasets with one episode of each fault, by the own score of each tool.",
         (0, 1, 2, 3, 4, 5),
     ),
     "long_recordings": Part(
