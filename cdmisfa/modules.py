@@ -24,6 +24,9 @@ if TYPE_CHECKING:  # learners must not import image code; who saves a module add
 # speed only.
 CHUNK = 1024
 
+# Kinds of the outputs of a module.
+SLOW, PRINCIPAL = "slow", "principal"
+
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Module(Described):
@@ -46,8 +49,10 @@ class Module(Described):
         scale: value of one gray level: 1/255, or 1 if it learned from values.
         frame_shape: shape of the frames, (height, width) or (values,); empty if unknown, for a
             module that was not learned.
-        slow: (J,) 1 where an output is slow on frames that it had not learned from, else 0; empty
-            except for the progress learner.
+        slow: (J,) 1 where a slow output is slow on frames that it had not learned from, else 0;
+            empty except for the progress learner.
+        kinds: kind of each output: `SLOW`, or `PRINCIPAL` for a principal component of variance 1;
+            by default all are slow.
         recipe: how a raw image becomes a frame; None while the module is in a learner.
     """
 
@@ -67,7 +72,13 @@ class Module(Described):
     scale: float = PIXEL
     frame_shape: tuple[int, ...] = ()
     slow: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    kinds: tuple[str, ...] = ()
     recipe: Recipe | None = None
+
+    def __post_init__(self) -> None:
+        """Make the kinds a tuple, and call all outputs slow unless their kinds are given."""
+        kinds = tuple(map(str, self.kinds)) or (SLOW,) * len(self.phi)
+        object.__setattr__(self, "kinds", kinds)
 
     def transform(
         self, frames: Any, outputs: int | slice | Sequence[int] | None = None
@@ -93,6 +104,15 @@ class Module(Described):
         phi = np.ascontiguousarray(chosen, np.float64)
         offset = kernels.mean_output(phi, self._mean)
         return _projected(self.rows(frames), self.expansion, phi, offset)
+
+    @property
+    def labels(self) -> list[str]:
+        """Number of each output from 1, and `slow`, `not slow` or `principal` if that is known."""
+        if not len(self.slow):
+            return [str(j) for j in range(1, len(self.phi) + 1)]
+        kinds = zip(self.kinds, self.slow, strict=True)
+        texts = [kind if is_slow or kind != SLOW else "not slow" for kind, is_slow in kinds]
+        return [f"{j} {text}" for j, text in enumerate(texts, 1)]
 
     @property
     def _mean(self) -> NDArray[np.float64]:

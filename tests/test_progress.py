@@ -146,7 +146,7 @@ def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> N
     frames = MovingPictures(*names).take(1, 5).frames
     for module, row in zip(opened.modules, live.as_json()["modules"], strict=True):
         assert (module.stream, module.stream_index) == (row["stream"], row["stream_index"])
-        assert module.transform(frames).shape == (5, 8)
+        assert module.transform(frames).shape == (5, 16)
     assert opened.signals["state"].shape == (live.iterations, 4)
 
 

@@ -171,14 +171,22 @@ def modules(learned: Sequence[ModuleInfo], *, policies: bool) -> None:
         line("no module was learned")
         return
     head = ["module", "stream", "iteration", "slowness"]
-    rows = [[m.index, m.stream, m.iteration, slownesses(m.slowness, m.slow)] for m in learned]
+    rows: list[list[Any]] = [[m.index, m.stream, m.iteration, _outputs(m)] for m in learned]
     if policies:
         head.insert(3, "policy")
         for row, module in zip(rows, learned, strict=True):
             row.insert(3, " ".join(ACTIONS[action] for action in module.policy))
     table(head, rows)
-    if any(0 in m.slow for m in learned):
+    if any("(" in row[-1] for row in rows):
         line("in brackets: not slow on new frames")
+
+
+def _outputs(module: ModuleInfo) -> str:
+    """Return the slowness of each slow output, and the number of the principal ones."""
+    slow = module.kinds.count("slow")
+    texts = [slownesses(module.slowness[:slow], module.slow[:slow])]
+    texts += [f"{module.kinds.count('principal')} principal"] * ("principal" in module.kinds)
+    return "; ".join(texts)
 
 
 def slownesses(eta: Sequence[float], slow: Sequence[int] = ()) -> str:

@@ -14,7 +14,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.experiments.sources import CAMERA_LEARNER, PASSES, Configuration
 from cdmisfa.features.following import batch_outputs, following_slowness
-from cdmisfa.modules import Module
+from cdmisfa.modules import SLOW, Module
 from replay.stored_source import StoredSource
 
 # Frames that are read at once. It limits memory and does not change the result.
@@ -81,7 +81,7 @@ def evaluate(
     components: int,
     stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any] | None:
-    """Compute the slowness of each module's outputs on the frames that were held out.
+    """Compute the slowness of each module's slow outputs on the frames that were held out.
 
     For comparison the result has the slowness of batch SFA with as many outputs on the same frames;
     batch SFA is fitted to the frames of the module's stream that the run used.
@@ -109,9 +109,9 @@ def evaluate(
         for stream in sorted({module.stream_index for module in modules}):
             of_stream = [module for module in modules if module.stream_index == stream]
             pieces = functools.partial(_pieces, source, of_stream[0], stop)
-            count, outputs = fitted[1] - fitted[0], len(of_stream[0].phi)
+            count, outputs = fitted[1] - fitted[0], of_stream[0].kinds.count(SLOW)
             phi, mean, _ = batch_outputs(pieces(*fitted), count, components, outputs)
-            weights = [(module.phi, module.mean) for module in of_stream]
+            weights = [(module.phi[:outputs], module.mean) for module in of_stream]
             *by_module, by_batch = following_slowness(pieces(*held_out), [*weights, (phi, mean)])
             for module, slowness in zip(of_stream, by_module, strict=True):
                 rows[module.index] = {

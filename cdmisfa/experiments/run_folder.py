@@ -228,6 +228,7 @@ def module_table(module: Module) -> dict[str, Any]:
         "policy": module.policy.tolist(),
         "eta": module.eta.tolist(),
         "slow": [bool(slow) for slow in module.slow],
+        "kinds": list(module.kinds),
         "recipe": None if module.recipe is None else module.recipe.as_json(),
     }
 

@@ -29,6 +29,10 @@ PIECE: int = kernels.lib.PIECE
 # update grow with it.
 STORED_PER_COMPONENT = 2
 
+# Directions that are stored beyond the components of the outputs, once these are more than the
+# leading ones. Measured on the tuning streams of benchmarks/features.py: see decision 0046.
+STORED_BEYOND_WIDE = 16
+
 # Smallest variance to divide by, so that a constant output has finite slowness.
 _MIN_VARIANCE = 1e-300
 
@@ -42,9 +46,9 @@ class RecursiveState(NamedTuple):
         variance: (L,) variance of the frames along each direction.
         differences: (L, L) mean products of the differences of consecutive frames along the
             directions.
-        weights: (J, L) the slow features as weights of the directions.
-        spectrum: (K,) slowness of all slow features, the slowest first; NaN for a feature that
-            does not exist.
+        weights: (J, L) the outputs as weights of the directions, the slow ones first.
+        spectrum: (K,) slowness of all slow features of the leading K components, the slowest
+            first; NaN for a feature that does not exist.
         last: (I,) the last frame.
         counts: (3,) number of directions in use, of frames in `mean` and `variance`, and of
             differences in `differences`. The latter two stop at the window.
@@ -77,17 +81,24 @@ class Agreement(NamedTuple):
 class RecursiveFeature:
     """Slow feature analysis of all frames so far, updated block by block.
 
+    The outputs are the slowest feature of the leading K components, then the other slow features,
+    then principal components with variance 1. After `widen` the other slow features are those of
+    more components that are uncorrelated with the first.
+
     If the frames vary in at most 2 K directions, no direction is dropped and the result does not
     depend on how the frames are cut into calls, up to rounding.
 
     Args:
         n_inputs: number of values I of a frame.
         components: number of whitened principal components K; 2 K are stored.
-        outputs: number of slow features J.
+        outputs: number of slow features.
         window: exponential window (frames); the first `window` frames have equal weights.
+        principal: number of principal components among the outputs.
+        wide: number of components after `widen`.
 
     Attributes:
         state: the arrays of the state; write into them to restore another state.
+        is_wide: whether the outputs are found among `wide` components.
 
     Example:
         >>> t = np.arange(2000.0)
@@ -98,26 +109,51 @@ class RecursiveFeature:
     """
 
     def __init__(
-        self, n_inputs: int, components: int, outputs: int = 1, window: int = 8000
+        self,
+        n_inputs: int,
+        components: int,
+        outputs: int = 1,
+        window: int = 8000,
+        *,
+        principal: int = 0,
+        wide: int = 0,
     ) -> None:
-        if n_inputs < 1 or not 1 <= outputs <= components or window < 1:
+        fits = 1 <= outputs <= components and 0 <= principal <= components
+        if n_inputs < 1 or not fits or window < 1:
             raise UsageError(
-                f"no SFA has {n_inputs} inputs, {components} components, {outputs} outputs and "
-                f"a window of {window}: set each to at least 1, and outputs to at most components"
+                f"no SFA has {n_inputs} inputs, {components} components, {outputs} outputs, "
+                f"{principal} principal outputs and a window of {window}: set each to at least 1, "
+                "and outputs to at most components"
             )
         size = min(STORED_PER_COMPONENT * components, n_inputs)
         components = min(components, n_inputs)
-        self.window = window
+        self.window, self.is_wide = window, False
+        self._principal, self._wide = min(principal, components), min(wide, n_inputs)
         self.state = RecursiveState(
             mean=np.zeros(n_inputs),
             basis=np.zeros((size, n_inputs)),
             variance=np.zeros(size),
             differences=np.zeros((size, size)),
-            weights=np.zeros((min(outputs, components), size)),
+            weights=np.zeros((min(outputs, components) + self._principal, size)),
             spectrum=np.full(components, np.nan),
             last=np.zeros(n_inputs),
             counts=np.zeros(3, np.int64),
         )
+
+    def widen(self) -> None:
+        """Find the outputs among `wide` components from now on, if these are more than K."""
+        state, n_inputs = self.state, len(self.state.mean)
+        more = min(self._wide + STORED_BEYOND_WIDE, n_inputs) - len(state.variance)
+        if self.is_wide or self._wide <= len(state.spectrum):
+            return
+        self.is_wide, rows = True, (0, max(more, 0))
+        self.state = state._replace(
+            basis=np.pad(state.basis, (rows, (0, 0))),
+            variance=np.pad(state.variance, rows),
+            differences=np.pad(state.differences, rows),
+            weights=np.pad(state.weights, ((0, 0), rows)),
+        )
+        self.__dict__.pop("_record", None)
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
         """Learn from consecutive frames.
@@ -140,7 +176,8 @@ class RecursiveFeature:
 
     @cached_property
     def _record(self) -> kernels.Struct:
-        return kernels.recursive_state(self.state._asdict(), self.window)
+        wide = self._wide if self.is_wide else 0
+        return kernels.recursive_state(self.state._asdict(), self.window, wide, self._principal)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all attributes but the C record, which holds pointers."""
@@ -152,8 +189,17 @@ class RecursiveFeature:
         return float(self.state.spectrum[0])
 
     @property
+    def output_slowness(self) -> FloatArray:
+        """(J,) slowness of each output on the frames learned from; NaN before the first."""
+        weights, variance = self.state.weights, self.state.variance
+        steps = (kernels.multiply(weights, self.state.differences) * weights).sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            squares = steps / (weights * weights * variance).sum(axis=1)
+            return np.asarray(np.sqrt(np.maximum(squares, 0.0)) / (2.0 * math.pi))
+
+    @property
     def phi(self) -> FloatArray:
-        """(J, I) slow features as weights of the centred frame."""
+        """(J, I) outputs as weights of the centred frame."""
         rank = self.state.counts[0]
         return kernels.multiply(self.state.weights[:, :rank], self.state.basis[:rank])
 

@@ -325,11 +325,18 @@ def _expect_inputs(agent: Struct, frozen: Struct, feature: Struct, x: Struct) ->
         expect(f"frozen {name}", len(frozen.arrays[name]), frozen.pointer.modules * length)
 
 
-def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
-    """Return a state of recursive SFA as C takes it; see `RecursiveState`."""
+def recursive_state(
+    arrays: Mapping[str, NDArray[Any]], window: int, wide: int = 0, principal: int = 0
+) -> Struct:
+    """Return a state of recursive SFA as C takes it; see `RecursiveState`.
+
+    The slow outputs after the first are those of `wide` components, if that is more than those of
+    the spectrum; the last `principal` outputs are principal components.
+    """
     (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
     components = len(arrays["spectrum"])
     expect_some(inputs=inputs, size=size, components=components, outputs=outputs, window=window)
+    expect("principal outputs fit", 0 <= principal < outputs, True)
     shapes = {
         "mean": (inputs,),
         "basis": (size, inputs),
@@ -342,7 +349,8 @@ def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
     pointers = {name: pointer(name, arrays[name], shape) for name, shape in shapes.items()}
     pointers["counts"] = pointer("counts", arrays["counts"], (3,), INT64)
     sizes = {"inputs": inputs, "size": size, "components": components, "outputs": outputs}
-    return Struct("recursive", {**sizes, "window": window}, pointers)
+    numbers = {**sizes, "window": window, "wide": wide, "principal": principal}
+    return Struct("recursive", numbers, pointers)
 
 
 def recursive_update(state: Struct, frames: Any, gap: bool) -> FloatArray:

@@ -162,17 +162,18 @@ int64_t gather(const uint8_t *data, int64_t size, const message *messages, int64
 /* eigen.c: matrix and vectors (n, n), values (n,), scratch (3 n,) */
 void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);
 
-/* recursive.c: I inputs, L directions, K whitened components, J outputs */
+/* recursive.c: I inputs, L directions, K whitened components, W of the outputs, J outputs */
 enum { PIECE = 64 }; /* frames in one update of the basis; longer blocks are cut into such pieces */
 typedef struct {
-  int64_t inputs, size, components, outputs; /* I, L, K, J */
+  int64_t inputs, size, components, wide, outputs; /* I, L, K, W, J */
+  int64_t principal;   /* the last outputs, which are principal components; the others are slow */
   int64_t window;      /* exponential window (frames) */
   double *mean;        /* (I,) */
   double *basis;       /* (L, I) orthonormal directions, in order of falling variance */
   double *variance;    /* (L,) variance of the frames along each direction */
   double *differences; /* (L, L) mean products of the differences of frames along the directions */
-  double *weights;     /* (J, L) slow features as weights of the directions */
-  double *spectrum;    /* (K,) slowness of all slow features, the slowest first */
+  double *weights;     /* (J, L) outputs as weights of the directions */
+  double *spectrum;    /* (K,) slowness of the slow features of K components, the slowest first */
   double *last;        /* (I,) the last frame */
   int64_t *counts;     /* (3,) directions in use, frames, differences */
 } recursive;

@@ -209,22 +209,59 @@ static void update_differences(const recursive *sfa, const piece *b, int skipped
     }
 }
 
-/* Compute the slow features: the directions of least difference among the whitened components. */
-static void solve_slowest(const recursive *sfa, int64_t rank, double *spare) {
-  int64_t size = sfa->size, k = smaller(sfa->components, rank);
+/* Compute the slow features of the first k components: values (k,) and vectors (k, k) of their mean
+ * square difference along directions of the whitened components, the fastest first. Of the
+ * directions that are uncorrelated with `first` (k,) unless it is NULL; then `first` is the fastest.
+ */
+static void solve_slowest(const recursive *sfa, int64_t k, const double *first, double *values,
+                          double *vectors, double *spare) {
   double *scale = take_zeros(&spare, k), *matrix = take_zeros(&spare, k * k);
-  double *values = take_zeros(&spare, k), *vectors = take_zeros(&spare, k * k);
+  double *moved = take_zeros(&spare, k), total = 0;
   for (int64_t i = 0; i < k; i++) scale[i] = 1 / sqrt(sfa->variance[i]);
   for (int64_t i = 0; i < k; i++)
     for (int64_t j = 0; j < k; j++)
-      matrix[i * k + j] = sfa->differences[i * size + j] * scale[i] * scale[j];
+      matrix[i * k + j] = sfa->differences[i * sfa->size + j] * scale[i] * scale[j];
+  if (first) {
+    for (int64_t i = 0; i < k; i++) {
+      moved[i] = dot(matrix + i * k, first, k);
+      total += matrix[i * k + i];
+    }
+    total += dot(moved, first, k);
+    for (int64_t i = 0; i < k; i++)
+      for (int64_t j = 0; j < k; j++)
+        matrix[i * k + j] += total * first[i] * first[j] - moved[i] * first[j] - first[i] * moved[j];
+  }
   eigen(k, matrix, values, vectors, spare);
-  memset(sfa->weights, 0, (size_t)(sfa->outputs * size) * sizeof(double));
+}
+
+/* Write slow feature o of k components, the one in a row of vectors (k, k), as an output. */
+static void write_output(const recursive *sfa, int64_t o, int64_t k, const double *vector) {
+  for (int64_t i = 0; i < k; i++)
+    sfa->weights[o * sfa->size + i] = vector[i] * (1 / sqrt(sfa->variance[i]));
+}
+
+/* Compute the outputs: the slowest feature of K components; the slowest of W components that are
+ * uncorrelated with it; and the largest components, divided by their standard deviation.
+ */
+static void solve_outputs(const recursive *sfa, int64_t rank, double *spare) {
+  int64_t k = smaller(sfa->components, rank), wide = smaller(sfa->wide, rank);
+  int64_t slow = sfa->outputs - sfa->principal;
+  double *values = take_zeros(&spare, sfa->size), *first = take_zeros(&spare, sfa->size);
+  double *vectors = take_zeros(&spare, sfa->size * sfa->size);
+  memset(sfa->weights, 0, (size_t)(sfa->outputs * sfa->size) * sizeof(double));
+  solve_slowest(sfa, k, NULL, values, vectors, spare);
   for (int64_t o = 0; o < sfa->components; o++)
     sfa->spectrum[o] = o < k ? sqrt(larger(values[k - 1 - o], 0)) / 6.283185307179586 : NAN;
-  for (int64_t o = 0; o < smaller(sfa->outputs, k); o++)
-    for (int64_t i = 0; i < k; i++)
-      sfa->weights[o * size + i] = vectors[(k - 1 - o) * k + i] * scale[i];
+  for (int64_t o = 0; o < smaller(slow, k); o++)
+    write_output(sfa, o, k, vectors + (k - 1 - o) * k);
+  if (wide > k) {
+    copy(vectors + (k - 1) * k, first, k);
+    solve_slowest(sfa, wide, first, values, vectors, spare);
+    for (int64_t o = 1; o < smaller(slow, wide); o++)
+      write_output(sfa, o, wide, vectors + (wide - o) * wide);
+  }
+  for (int64_t o = 0; o < smaller(sfa->principal, rank); o++)
+    sfa->weights[(slow + o) * sfa->size + o] = 1 / sqrt(sfa->variance[o]);
 }
 
 /* Keep the signs of the outputs, and return the change of the slowest one: equation P1. `before`
@@ -276,7 +313,7 @@ static double learn_piece(const recursive *sfa, const frames *x, int64_t first, 
   counts[0] = b.k;
   counts[1] = smaller(seen, sfa->window - m) + m;
   counts[2] = smaller(counts[2], sfa->window - (m - skipped)) + m - skipped;
-  solve_slowest(sfa, b.k, spare);
+  solve_outputs(sfa, b.k, spare);
   return align_outputs(sfa, b.k, before, spare);
 }
 

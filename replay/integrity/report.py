@@ -68,6 +68,7 @@ class ModuleInfo:
     """A module: the slowness of each output, and 1 or 0 where it is known to be slow or not.
 
     Attributes:
+        kinds: kind of each output, "slow" or "principal".
         iteration: iteration at whose end the module was saved.
         policy: policy during learning; for each stream 0 to stay and 1 to switch.
     """
@@ -78,6 +79,7 @@ class ModuleInfo:
     slow: tuple[int, ...]
     iteration: int
     policy: tuple[int, ...]
+    kinds: tuple[str, ...]
 
     @classmethod
     def of(cls, module: Module) -> ModuleInfo:
@@ -85,7 +87,8 @@ class ModuleInfo:
         slowness, slow, policy = (
             tuple(m.tolist()) for m in (module.eta, module.slow, module.policy)
         )
-        return cls(module.index, module.stream, slowness, slow, module.iteration, policy)
+        facts = module.iteration, policy, module.kinds
+        return cls(module.index, module.stream, slowness, slow, *facts)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.expansion import EXPANSIONS, expanded_size
-from cdmisfa.modules import Module
+from cdmisfa.modules import PRINCIPAL, SLOW, Module
 from recorder.images.framing import Recipe
 from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
@@ -22,14 +22,16 @@ from replay.storage.arrays import read_arrays
 
 _FIELDS = [field.name for field in dataclasses.fields(Module)]
 
-# Scalar fields, and the kinds of numpy type that each may be stored as.
-_SCALARS = {
+# Kinds of numpy type that fields may be stored as; all but the last are scalars.
+_TYPES = {
     **dict.fromkeys(("index", "stream_index", "iteration"), "iu"),
     "stream": "U",
     "expansion": "U",
     "recipe": "U",
     "scale": "f",
+    "kinds": "U",
 }
+_SCALARS = _TYPES.keys() - {"kinds"}
 
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:
@@ -67,13 +69,15 @@ def load_modules(path: Path) -> tuple[Module, ...]:
 
 def _modules(stored: Mapping[str, NDArray[Any]]) -> Iterator[Module]:
     """Yield the modules of a file; a checksum protects its arrays, but not their names."""
-    indices = range(1, len(stored) // len(_FIELDS) + 1)
-    if stored.keys() != {_key(index, name) for index in indices for name in _FIELDS}:
+    # Files written before modules had principal components have no kinds: all outputs are slow.
+    names = [name for name in _FIELDS if name != "kinds" or _key(1, name) in stored]
+    indices = range(1, len(stored) // len(names) + 1)
+    if stored.keys() != {_key(index, name) for index in indices for name in names}:
         raise ValueError(f"its arrays are not those of modules 1 to {len(indices)}")
     for index in indices:
         values: dict[str, Any] = {}
-        for name in _FIELDS:
-            array, kinds = stored[_key(index, name)], _SCALARS.get(name, "fi")
+        for name in names:
+            array, kinds = stored[_key(index, name)], _TYPES.get(name, "fi")
             if array.dtype.kind not in kinds:
                 raise ValueError(f"{name} is not of type {kinds}")
             values[name] = array.item() if name in _SCALARS else array
@@ -103,6 +107,8 @@ def checked(module: Module) -> Module:
             raise ValueError(f"{name} is not finite")
     if not (J and size and streams and min(module.stream_index, module.iteration) >= 0):
         raise ValueError(f"module {module.index} has no outputs, or a negative number")
+    if len(module.kinds) != J or not {SLOW, PRINCIPAL}.issuperset(module.kinds):
+        raise ValueError(f"outputs are of the kinds {module.kinds}")
     known = bool(shape) and module.expansion in EXPANSIONS  # others can be used once registered
     if min(shape, default=1) < 1 or (
         known and expanded_size(module.expansion, prod(shape)) != size

@@ -57,7 +57,7 @@ class ViewSink:
         self._writer.lines(f"block_slowness/{stream}", names, first, slowness[None])
         self._writer.lines(f"novelty/{stream}", names, first, applied.novelty[None])
         for module, columns in self._modules:
-            outputs = [f"y{j}" for j in range(1, len(module.phi) + 1)]
+            outputs = [f"y{label}" for label in module.labels]
             path = f"outputs/{stream}/{module.index}"
             self._writer.lines(path, outputs, (frames, None), applied.y[:, columns], gap=1)
 

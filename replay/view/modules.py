@@ -188,12 +188,9 @@ class ModulesView:
         saved = {save.module: save.t for save in outline.saved}
         for number, stream in self._known.items():
             module, place = stream.module, f"modules/{number}"
-            slow = module.slow.astype(bool).tolist()
-            labels = [f"{j} {'slow' if one else 'not slow'}" for j, one in enumerate(slow, 1)]
-            rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in slow]
-            labels = labels or _numbers(module.phi)
+            rgbs = [colour(module.stream_index) if is_slow else GREY for is_slow in module.slow]
             of = f"{place}/weights", module.stream_index
-            hang_weights(self._writer, *of, labels, rgbs)
+            hang_weights(self._writer, *of, module.labels, rgbs)
             at = saved.get(number, outline.end), module.iteration
             write_weights(self._writer, *of, *at, module.phi)
             spec = self._writer.spec.of(module.stream_index)

@@ -76,9 +76,10 @@ class Candidate:
     Args:
         n_inputs: number of inputs I.
         components: number of whitened components K.
-        outputs: number of slow features J.
+        outputs: number of slow features.
         window: exponential window of the SFA statistics (frames).
         test_window: exponential window of the tests (blocks).
+        more: `principal` and `wide` of the recursive SFA.
 
     Attributes:
         sfa: the recursive SFA.
@@ -94,9 +95,15 @@ class Candidate:
     """
 
     def __init__(
-        self, n_inputs: int, components: int, outputs: int, window: int, test_window: int
+        self,
+        n_inputs: int,
+        components: int,
+        outputs: int,
+        window: int,
+        test_window: int,
+        **more: int,
     ) -> None:
-        self.sfa = RecursiveFeature(n_inputs, components, outputs, window)
+        self.sfa = RecursiveFeature(n_inputs, components, outputs, window, **more)
         n_outputs = len(self.sfa.state.weights)
         self.test_window = test_window
         self.blocks = self.tests = self._reference_age = 0
@@ -228,6 +235,8 @@ class Candidate:
         Raises:
             ValueError: an array is missing or has a different shape or type.
         """
+        if len(arrays["sfa.variance"]) > len(self.sfa.state.variance):
+            self.sfa.widen()
         current = self.arrays
         overwrite(current, arrays)
         self.blocks, self.tests, self._reference_age = current["counters"].tolist()

@@ -19,8 +19,11 @@ class ProgressConfig(Section):
         algorithm: `progress`.
         tau: block length in frames.
         components: number of principal components that are whitened for each stream. The learner
-            tracks twice as many.
-        outputs: number of slow features of a module. Decisions use the slowest one.
+            tracks twice as many. Decisions use the slowest feature of these.
+        outputs: number of slow features of a module.
+        principal: number of principal components of a module, after its slow features.
+        wide: number of components of the slow features after the first, from the moment at which
+            a stream promises to be learned; at most `components`: no more than these.
         expansion: `none`, `quadratic` to add all products of two inputs, or `auto`: quadratic if
             all products fit into `components` (up to 4 values a frame), else none.
         window: exponential window of the statistics of a stream (frames).
@@ -44,6 +47,8 @@ class ProgressConfig(Section):
     tau: int = key(40, 3, MAX_TAU)
     components: int = key(16, 1, MAX_COMPONENTS)
     outputs: int = key(8, 1, "components")
+    principal: int = key(8, 0, "components")
+    wide: int = key(48, 0, MAX_COMPONENTS)
     expansion: str | None = None
     window: int = key(8000, 1)
     attention: Literal["novel", "progress", "random"] = "novel"

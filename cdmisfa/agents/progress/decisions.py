@@ -152,7 +152,7 @@ def disagreement(candidate: Candidate) -> float:
 def slow_outputs(candidate: Candidate, config: ProgressConfig) -> NDArray[np.int64]:
     """Return (J,) 1 for each output that meets the criteria of a saved slowest output, else 0."""
     low, high = VARIANCE_BOUNDS
-    tested, fitted = candidate.tested, candidate.sfa.state.spectrum[: len(candidate.variance)]
+    tested, fitted = candidate.tested, candidate.sfa.output_slowness
     apart = [abs(log_ratio(float(a), float(b))) for a, b in zip(tested, fitted, strict=True)]
     varies = (low < candidate.variance) & (candidate.variance < high)
     agrees, below = np.array(apart) < config.agreement, config.slow * candidate.typical

@@ -41,6 +41,7 @@ class FrameKinds:
     """The kinds of frames of the streams; a module applies only to streams of its own kind.
 
     Attributes:
+        slow: number of slow outputs of a signal, which come first.
         outputs: number of outputs J of a signal; streams with fewer have NaN for the rest.
         most_inputs: largest number of inputs of a kind.
     """
@@ -49,7 +50,8 @@ class FrameKinds:
         self._kinds = [spec.kind(stream) for stream in range(len(spec.streams))]
         self._inputs = {kind: StreamInputs.of(*kind, config) for kind in spec.every_kind}
         self.most_inputs = max(inputs.size for inputs in self._inputs.values())
-        self.outputs = min(config.outputs, self.most_inputs)
+        self.slow = min(config.outputs, self.most_inputs)
+        self.outputs = self.slow + min(config.principal, self.most_inputs)
 
     def inputs(self, stream: int) -> StreamInputs:
         """Return how frames of a stream become inputs."""
@@ -77,13 +79,15 @@ class FrameKinds:
         if (stack := self._stacks.get(self._kinds[stream])) is not None:
             indices, phi, offset = stack
             outputs = kernels.outputs(phi, offset, frames).reshape(len(frames), len(indices), -1)
-            y[indices, :, : outputs.shape[2]] = outputs.transpose(1, 0, 2)
+            y[indices] = self.spread(outputs, self.inputs(stream)).transpose(1, 0, 2)
         return y
 
-    def wide(self, values: FloatArray) -> FloatArray:
-        """Return (..., j) values of the outputs as (..., J), with NaN beyond j."""
+    def spread(self, values: FloatArray, inputs: StreamInputs) -> FloatArray:
+        """Return (..., j) values of the outputs of a kind as (..., J), with NaN for the missing."""
         if values.shape[-1] == self.outputs:
             return values
+        slow = min(self.slow, inputs.size)
         whole = np.full((*values.shape[:-1], self.outputs), np.nan)
-        whole[..., : values.shape[-1]] = values
+        whole[..., :slow] = values[..., :slow]
+        whole[..., self.slow : self.slow + values.shape[-1] - slow] = values[..., slow:]
         return whole

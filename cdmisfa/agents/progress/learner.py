@@ -27,8 +27,8 @@ from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.outcomes import NO_PROGRESS, outcome_text
 from cdmisfa.core.signals import STATES, BlockSignals
-from cdmisfa.features.recursive import STORED_PER_COMPONENT
-from cdmisfa.modules import Module
+from cdmisfa.features.recursive import STORED_BEYOND_WIDE, STORED_PER_COMPONENT
+from cdmisfa.modules import PRINCIPAL, SLOW, Module
 
 # Smallest test window in blocks, also if `learner.test_frames` holds fewer. Set by hand: the change
 # of an output is a mean over blocks, and fewer blocks make it too noisy to compare. It matters from
@@ -78,7 +78,8 @@ class ProgressLearner:
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
         self._streams = decisions.new_streams(len(spec.streams))
-        size = 8 * most * (STORED_PER_COMPONENT * config.components + self._n_outputs + 4)
+        stored = max(STORED_PER_COMPONENT * config.components, config.wide + STORED_BEYOND_WIDE)
+        size = 8 * most * (stored + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
         self.rule = RULES[config.attention]
         self._kinds.stack(self.modules)
@@ -161,14 +162,16 @@ class ProgressLearner:
             CdmisfaError: the block holds a value that is not finite.
         """
         stream, count = block.stream, len(self.modules)
-        rows = rows_of(block, self.spec, self.stream, self.tau)
-        frames = expand(self._kinds.inputs(stream).expansion, rows)
+        rows, inputs = rows_of(block, self.spec, self.stream, self.tau), self._kinds.inputs(stream)
+        frames = expand(inputs.expansion, rows)
         row, counts = self._streams[stream], self._counts[0]
         undecided = int(row["state"]) == decisions.LEARNING
         candidate = self._candidates.get_or_create(stream, self._learning, self._streams["last"])
         y_frozen = self._kinds.module_outputs(stream, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(row["next"]) != block.t)
+        if decisions.is_promising(candidate, self.config):
+            candidate.sfa.widen()
         row["next"], row["last"] = block.t + len(block), counts["iteration"]
         row["visits"] += 1
         counts["iteration"] += 1
@@ -179,9 +182,12 @@ class ProgressLearner:
         interests, explored = self._choose(self._rng.random(2))
         tested, gained = candidate.tested, error - candidate.error
         slowness = [kernels.instantaneous_slowness(y) for y in y_frozen]
-        y = self._kinds.wide(candidate.y)
+        y = self._kinds.spread(candidate.y, inputs)
         shape = (count, self._n_outputs)
-        etas = [self._kinds.wide(module.eta) for module in self.modules[:count]]
+        etas = [
+            self._kinds.spread(module.eta, self._kinds.inputs(module.stream_index))
+            for module in self.modules[:count]
+        ]
         signals: dict[str, Any] = {
             "novel": undecided and candidate.varies,
             "known_by": int(row["module"]) + 1 if candidate.varies else -1,
@@ -189,7 +195,7 @@ class ProgressLearner:
             "novel_blocks": candidate.blocks,
             "y": y,
             "y_frozen": y_frozen,
-            "eta": self._kinds.wide(tested),
+            "eta": self._kinds.spread(tested, inputs),
             "eta_inst": kernels.instantaneous_slowness(y),
             "eta_inst_frozen": np.array(slowness).reshape(shape),
             "band_mean": np.array(etas).reshape(shape),
@@ -211,7 +217,7 @@ class ProgressLearner:
             "regret": candidate.improvement,
         }
         if candidate.tests:
-            signals["variance"] = self._kinds.wide(candidate.variance)
+            signals["variance"] = self._kinds.spread(candidate.variance, inputs)
         sizes = {"outputs": self._n_outputs, "modules": count}
         return signals_of_block(block, self.spec, self.iteration - 1, **sizes, **signals)
 
@@ -242,7 +248,8 @@ class ProgressLearner:
 
     def _new_candidate(self, stream: int) -> Candidate:
         c, size = self.config, self._kinds.inputs(stream).size
-        return Candidate(size, c.components, c.outputs, c.window, self._test_window)
+        more = {"principal": c.principal, "wide": c.wide}
+        return Candidate(size, c.components, c.outputs, c.window, self._test_window, **more)
 
     def _decide(self, stream: int, candidate: Candidate, frames: NDArray[Any]) -> tuple[str, ...]:
         """Decide about a stream after a block of it, and return the events."""
@@ -312,8 +319,8 @@ class ProgressLearner:
         if index == before:
             return self._event(stream, f"is still explained by module {index + 1}")
         text = outcome_text(STATES[state], index + 1, int(row["decided"]), eta)
-        if new and self._n_outputs > 1:
-            text += f"; {int(module.slow.sum())} of {len(module.slow)} outputs slow"
+        if new and self._kinds.slow > 1:
+            text += f"; {int(module.slow.sum())} of {module.kinds.count(SLOW)} outputs slow"
         return self._event(stream, f"{'has changed and is' if before >= 0 else 'is'} {text}")
 
     def _learn_again(self, stream: int, module: int) -> None:
@@ -340,6 +347,9 @@ class ProgressLearner:
 
     def _module(self, stream: int, candidate: Candidate) -> Module:
         inputs = self._kinds.inputs(stream)
+        slow = decisions.slow_outputs(candidate, self.config)
+        count = min(self.config.outputs, inputs.size)
+        slow[count:] = 0
         return Module(
             index=len(self.modules) + 1,
             stream=self.spec.streams[stream],
@@ -353,7 +363,8 @@ class ProgressLearner:
             policy=self._policy,
             expansion=inputs.expansion,
             scale=inputs.scale,
-            slow=decisions.slow_outputs(candidate, self.config),
+            slow=slow,
+            kinds=count * (SLOW,) + (len(slow) - count) * (PRINCIPAL,),
             frame_shape=self.spec.kind(stream)[0],
         )
 
