@@ -10,7 +10,7 @@ import benchmarks
 from benchmarks.report import write_page
 
 # Benchmarks that run only if they are named: these take half an hour or more.
-ONLY_BY_NAME = {"constants", "dots", "episode_peers", "episodes", "policies"}
+ONLY_BY_NAME = {"constants", "dots", "episode_peers", "episodes", "features", "policies"}
 
 # Modules without a benchmark of their own.
 NO_BENCHMARKS = {

@@ -139,9 +139,10 @@ static void test_incsfa(void) {
   tell("incsfa_by_gram");
 }
 
-static void test_recursive(void) {
+static void test_recursive(int mixed) {
   enum { I = 300, L = 14, K = 9, J = 4 };
-  recursive s = {.inputs = I, .size = L, .components = K, .outputs = J, .window = 150,
+  recursive s = {.inputs = I, .size = L, .components = K - 4 * mixed, .outputs = J, .window = 150,
+                 .wide = 12 * mixed, .principal = 2 * mixed,
                  .mean = room(I * 8), .basis = room(L * I * 8), .variance = room(L * 8),
                  .differences = room(L * L * 8), .weights = room(J * L * 8),
                  .spectrum = room(K * 8), .last = room(I * 8), .counts = room(3 * 8)};
@@ -155,7 +156,8 @@ static void test_recursive(void) {
   add(s.mean, I * 8), add(s.basis, L * I * 8), add(s.variance, L * 8);
   add(s.differences, L * L * 8), add(s.weights, J * L * 8), add(s.spectrum, K * 8);
   add(s.last, I * 8), add(s.counts, 3 * 8);
-  tell("recursive_update");
+  tell(mixed ? "recursive_update, wide" : "recursive_update");
+  if (mixed) return;
   for (int64_t n = 1; n < 30; n++) {
     double *matrix = doubles(n * n, 2), *values = room(n * 8), *vectors = room(n * n * 8);
     double *product = room(n * n * 8);
@@ -279,8 +281,9 @@ int main(void) {
   test_elementary();
   test_projection();
   test_incsfa();
-  test_recursive();
+  test_recursive(0);
   test_agent();
   test_records();
+  test_recursive(1);
   return 0;
 }

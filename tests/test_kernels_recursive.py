@@ -39,7 +39,11 @@ def streams(draw: st.DrawFn) -> tuple[RecursiveFeature, list[NDArray[Any]], list
     if draw(st.booleans()):
         blocks[draw(st.integers(0, len(blocks) - 1))][:] = x[0]
     gaps = [draw(st.booleans()) for _ in blocks]
-    return RecursiveFeature(inputs, components, outputs, draw(st.integers(1, 400))), blocks, gaps
+    more = {"principal": draw(st.integers(0, min(components, 3))), "wide": draw(st.integers(0, 30))}
+    sfa = RecursiveFeature(inputs, components, outputs, draw(st.integers(1, 400)), **more)
+    if draw(st.booleans()):
+        sfa.widen()
+    return sfa, blocks, gaps
 
 
 def copied(state: RecursiveState) -> RecursiveState:
@@ -65,7 +69,8 @@ def test_equals_the_reference(
     for frames, gap in zip(blocks, gaps, strict=True):
         expected = copied(sfa.state)
         values = frames * (1 / 255) if frames.dtype == np.uint8 else frames
-        change = reference.update(expected, values, gap, sfa.window)
+        more = sfa._wide if sfa.is_wide else 0, sfa._principal
+        change = reference.update(expected, values, gap, sfa.window, *more)
         result = sfa.update(frames, gap)
         assert sfa.state.counts.tolist() == expected.counts.tolist()
         k = expected.counts[0]

@@ -105,7 +105,7 @@ def test_a_keyframe_holds_modules_of_several_shapes(run: Any) -> None:
     again = decode_keyframe(encode_keyframe(keyframe)).state
     for module, restored in zip(learner.modules, again.modules, strict=True):
         np.testing.assert_array_equal(module.phi, restored.phi)
-    assert {m.phi.shape for m in again.modules} == {(8, 9), (8, 192)}
+    assert {m.phi.shape for m in again.modules} == {(16, 9), (16, 192)}
 
 
 @settings(max_examples=20, deadline=None)

@@ -303,7 +303,7 @@ def test_eight_outputs_are_decided_as_one_and_marked(cdmisfa: Cdmisfa, tmp_path:
         assert row["eta"] == signals["eta"][module.iteration].tolist() == module.eta.tolist()
         assert (module.eta[module.slow > 0] < 0.15).all()
     stroll = next(m for m in opened if m.stream == "stroll")
-    assert stroll.slow.tolist() == [1] + 7 * [0]
+    assert stroll.slow.tolist() == [1] + 15 * [0]
     y = stroll.transform(frames)
     np.testing.assert_allclose(stroll.transform(frames, outputs=0), y[:, :1])
     said = cdmisfa("info", tmp_path / "run").out

@@ -149,7 +149,7 @@ def _probes(course: Course, source: ArenaSource, terms: tuple[int, str]) -> dict
     return dict(zip(("R2", "R2 of components"), means, strict=True))
 
 
-def probe(features: FloatArray, state: FloatArray) -> float:
+def probe(features: FloatArray, state: FloatArray, labels: int | None = None) -> float:
     """Return how well a linear map predicts the state of the world from features, mean R^2.
 
     Ridge regression is fitted on the first three quarters of the frames and judged on the last.
@@ -159,15 +159,17 @@ def probe(features: FloatArray, state: FloatArray) -> float:
     Args:
         features: (n, J).
         state: (n, C).
+        labels: number of the frames to fit that are used, spread evenly; None: all.
     """
     cut = 3 * len(state) // 4
-    moves = (np.ptp(state[:cut], axis=0) > 0) & (np.ptp(state[cut:], axis=0) > 0)
-    x = features - features[:cut].mean(axis=0)
-    scale = x[:cut].std(axis=0)
-    x = x[:, scale > 0] / scale[scale > 0]
-    s = state[:, moves] - state[:cut, moves].mean(axis=0)
-    gram = x[:cut].T @ x[:cut] + RIDGE * cut * np.eye(x.shape[1])
-    weights = np.linalg.solve(gram, x[:cut].T @ s[:cut])
+    rows = np.linspace(0, cut - 1, labels or cut).round().astype(int)
+    fitted, known = features[rows], state[rows]
+    moves = (np.ptp(known, axis=0) > 0) & (np.ptp(state[cut:], axis=0) > 0)
+    scale = fitted.std(axis=0)
+    x = (features - fitted.mean(axis=0))[:, scale > 0] / scale[scale > 0]
+    s = (state - known.mean(axis=0))[:, moves]
+    gram = x[rows].T @ x[rows] + RIDGE * len(rows) * np.eye(x.shape[1])
+    weights = np.linalg.solve(gram, x[rows].T @ s[rows])
     error = ((s[cut:] - x[cut:] @ weights) ** 2).sum(axis=0)
     total = ((s[cut:] - s[cut:].mean(axis=0)) ** 2).sum(axis=0)
     return float(np.maximum(1 - error / total, 0).mean())

@@ -177,11 +177,13 @@ class RecursiveSFA(_SlowFeatures):
         n_whitened: number of principal components among which they are found, at most the number
             of features of X.
         window: exponential window (samples); the first `window` samples have equal weights.
+        n_principal: number of principal components with variance 1 that follow the slow features,
+            as in a module; J = n_components + n_principal outputs.
 
     Attributes:
-        components_: (n_components, n_features_in_) weights of the centred sample.
+        components_: (J, n_features_in_) weights of the centred sample.
         mean_: (n_features_in_,) mean of the samples.
-        slowness_: (n_components,) slowness of each feature (cycles a sample).
+        slowness_: (J,) slowness of each output (cycles a sample).
         n_samples_seen_: number of samples learned from.
         n_features_in_: number of features of X.
         feature_names_in_: names of the features of X, if X has names.
@@ -194,21 +196,30 @@ class RecursiveSFA(_SlowFeatures):
         0.99
     """
 
-    def __init__(self, n_components: int = 1, *, n_whitened: int = 16, window: int = 8000) -> None:
+    def __init__(
+        self,
+        n_components: int = 1,
+        *,
+        n_whitened: int = 16,
+        window: int = 8000,
+        n_principal: int = 0,
+    ) -> None:
         self.n_components = n_components
         self.n_whitened = n_whitened
         self.window = window
+        self.n_principal = n_principal
 
     @property
     def slowness_(self) -> FloatArray:
-        """(n_components,) slowness, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN before it is learned."""
-        return np.array(self._feature.state.spectrum[: self._n_features_out])
+        """(J,) slowness, sqrt(E(ydot^2) / Var(y)) / 2 pi; NaN before it is learned."""
+        feature, slow = self._feature, self._n_features_out - self.n_principal
+        return np.append(feature.state.spectrum[:slow], feature.output_slowness[slow:])
 
     def inverse_transform(self, Y: Any) -> FloatArray:
         """Return the samples that have these outputs with the least mean square error.
 
         Args:
-            Y: (n, n_components) outputs.
+            Y: (n, J) outputs.
 
         Returns:
             (n, I) samples.
@@ -221,12 +232,22 @@ class RecursiveSFA(_SlowFeatures):
         Y, state = np.asarray(Y, np.float64), self._feature.state
         if Y.ndim != 2 or Y.shape[1] != self._n_features_out:
             raise ValueError(f"Y has the shape {Y.shape}: give (n, {self._n_features_out})")
+        if self.n_principal:  # slow features are uncorrelated with one another, not with these
+            Y = Y @ np.linalg.pinv(
+                multiply(state.weights * state.variance, state.weights.T), hermitian=True
+            )
         patterns = multiply(state.weights * state.variance, state.basis)
         return np.asarray(multiply(np.ascontiguousarray(Y), patterns) + self.mean_)
 
+    def _check(self, n_features: int) -> None:
+        super()._check(n_features)
+        limit, value = min(self.n_whitened, n_features), self.n_principal
+        if not isinstance(value, Integral) or isinstance(value, bool) or not 0 <= value <= limit:
+            raise ValueError(f"n_principal is {value!r}: give a whole number from 0 to {limit}")
+
     def _begin(self, n_features: int) -> Any:
-        whitened = min(self.n_whitened, n_features)
-        return RecursiveFeature(n_features, whitened, self.n_components, self.window)
+        sizes = n_features, min(self.n_whitened, n_features), self.n_components, self.window
+        return RecursiveFeature(*sizes, principal=self.n_principal)
 
 
 class IncSFA(_SlowFeatures):

@@ -314,7 +314,7 @@ class _ModuleTracker:
         low, high = decisions.MODULE_VARIANCE_BOUNDS
         for i, eta in self._etas.items() if len(y) > 1 else ():
             ratio = steps[i] / (2 * math.pi * eta) ** 2
-            relative = slowness_by_moments(steps[i], variance[i]) / eta
+            relative = float(slowness_by_moments(steps[i], variance[i])) / eta
             novelty[i] = decisions.novelty(power[i], ratio, relative)
         return Applied(block, y, slowness, (low < variance) & (variance < high), novelty)
 

@@ -101,8 +101,7 @@ class SlownessSums:
         if not self._steps:
             return np.full(len(self._total), np.nan)
         variance = self._squares / self._count - (self._total / self._count) ** 2
-        moments = zip(self._moved / self._steps, variance, strict=True)
-        return np.array([slowness_by_moments(d, v) for d, v in moments])
+        return slowness_by_moments(self._moved / self._steps, variance)
 
 
 def following_slowness(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,11 @@ def project(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
     return kernels.outputs(phi, offset, frames)
 
 
-def slowness_by_moments(derivative_square: float, variance: float) -> float:
+def slowness_by_moments(derivative_square: Any, variance: Any) -> FloatArray:
     """Return the slowness (cycles a frame) for E(ydot^2) and Var(y); infinite without variance."""
-    return float(kernels.lib.slowness(derivative_square, variance))
+    with np.errstate(all="ignore"):
+        slowness = np.sqrt(np.divide(derivative_square, variance)) / (2.0 * math.pi)
+        return np.where(np.asarray(variance) <= 0, math.inf, slowness)
 
 
 def window_rate(window: float, count: int) -> float:

@@ -29,10 +29,6 @@ PIECE: int = kernels.lib.PIECE
 # update grow with it.
 STORED_PER_COMPONENT = 2
 
-# Directions that are stored beyond the components of the outputs, once these are more than the
-# leading ones. Measured on the tuning streams of benchmarks/features.py: see decision 0046.
-STORED_BEYOND_WIDE = 16
-
 # Smallest variance to divide by, so that a constant output has finite slowness.
 _MIN_VARIANCE = 1e-300
 
@@ -94,7 +90,7 @@ class RecursiveFeature:
         outputs: number of slow features.
         window: exponential window (frames); the first `window` frames have equal weights.
         principal: number of principal components among the outputs.
-        wide: number of components after `widen`.
+        wide: number of components after `widen`, of which as many are stored, or 2 K.
 
     Attributes:
         state: the arrays of the state; write into them to restore another state.
@@ -142,11 +138,10 @@ class RecursiveFeature:
 
     def widen(self) -> None:
         """Find the outputs among `wide` components from now on, if these are more than K."""
-        state, n_inputs = self.state, len(self.state.mean)
-        more = min(self._wide + STORED_BEYOND_WIDE, n_inputs) - len(state.variance)
+        state = self.state
         if self.is_wide or self._wide <= len(state.spectrum):
             return
-        self.is_wide, rows = True, (0, max(more, 0))
+        self.is_wide, rows = True, (0, max(self._wide - len(state.variance), 0))
         self.state = state._replace(
             basis=np.pad(state.basis, (rows, (0, 0))),
             variance=np.pad(state.variance, rows),

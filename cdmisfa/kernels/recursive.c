@@ -155,7 +155,7 @@ static void solve_weights(const piece *b, const double *factor, const double *ve
  * streams, with 1.5 0.96, with 2 0.999; more rows take more time.
  */
 static void merge_rows(const recursive *sfa, piece *b, double *spare) {
-  int64_t r = b->rank + b->m, size = sfa->size, p, most = smaller(size + size / 2, r);
+  int64_t r = b->rank + b->m, size = sfa->size, p, most = smaller(size + smaller(size / 2, 16), r);
   double *gram = take_zeros(&spare, r * r), *factor = take_zeros(&spare, most * r);
   double *squares = take_zeros(&spare, r), *vectors = take_zeros(&spare, r * r);
   double total = b->seen + (double)b->m;

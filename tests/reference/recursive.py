@@ -29,7 +29,9 @@ def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return values[::-1], vectors.T[::-1]
 
 
-def learn_piece(state: RecursiveState, x: FloatArray, gap: bool, window: int) -> float:
+def learn_piece(
+    state: RecursiveState, x: FloatArray, gap: bool, window: int, wide: int, principal: int
+) -> float:
     """Take in a piece of a block (m, I) of values; the change of the slowest output."""
     rank, seen, pairs = state.counts.tolist()
     size, (m, _) = len(state.variance), x.shape
@@ -40,7 +42,7 @@ def learn_piece(state: RecursiveState, x: FloatArray, gap: bool, window: int) ->
     weighted = np.sqrt(seen * state.variance[:rank, None]) * basis
     rows = np.vstack([weighted, u - moved * u.mean(axis=0)])
     least = 1e-28 * (state.mean @ state.mean) * (seen + m)
-    span = most_different(rows, min(size + size // 2, len(rows)), least)
+    span = most_different(rows, min(size + min(size // 2, 16), len(rows)), least)
     squares, vectors = eigen((rows @ span.T).T @ (rows @ span.T))
     k = int((squares > max(least, 1e-8 * squares.max(initial=0.0)))[:size].sum())
     new, variance = vectors[:k] @ span, squares[:k] / (seen + m)
@@ -56,19 +58,28 @@ def learn_piece(state: RecursiveState, x: FloatArray, gap: bool, window: int) ->
     state.variance[:k] = variance
     state.differences[:k, :k] = total / max(pairs + len(steps), 1)
     state.counts[:] = k, min(seen + m, window), min(pairs + len(steps), window)
-    solve(state, k)
+    solve(state, k, wide, principal)
     return change(state.weights[:, :k], before, variance)
 
 
-def solve(state: RecursiveState, rank: int) -> None:
-    """The slow features: least difference among the whitened components."""
-    k = min(rank, len(state.spectrum))
-    scale = 1 / np.sqrt(state.variance[:k])
-    values, vectors = eigen(scale[:, None] * state.differences[:k, :k] * scale)
+def solve(state: RecursiveState, rank: int, wide: int, principal: int) -> None:
+    """The outputs: least difference among whitened components, and principal components."""
+    k, slow = min(rank, len(state.spectrum)), len(state.weights) - principal
+    scale = 1 / np.sqrt(state.variance[:rank])
+    whitened = scale[:, None] * state.differences[:rank, :rank] * scale
+    values, vectors = eigen(whitened[:k, :k])
     state.spectrum[:] = np.nan
     state.spectrum[:k] = np.sqrt(np.maximum(values[::-1], 0.0)) / (2 * np.pi)
-    shown = (vectors[::-1] * scale)[: len(state.weights)]
-    state.weights[: len(shown), :k] = shown
+    shown = vectors[::-1][:slow]
+    state.weights[: len(shown), :k] = shown * scale[:k]
+    if min(wide, rank) > k:
+        first = np.pad(shown[0], (0, min(wide, rank) - k))
+        rest = np.linalg.svd(first[None])[2][1:]  # directions of no correlation with the first
+        _, vectors = eigen(rest @ whitened[: len(first), : len(first)] @ rest.T)
+        shown = (vectors[::-1] @ rest)[: slow - 1]
+        state.weights[1 : len(shown) + 1, : len(first)] = shown * scale[: len(first)]
+    for i in range(min(principal, rank)):
+        state.weights[slow + i, i] = scale[i]
 
 
 def change(weights: FloatArray, before: FloatArray, variance: FloatArray) -> float:
@@ -80,10 +91,18 @@ def change(weights: FloatArray, before: FloatArray, variance: FloatArray) -> flo
     return float(np.sqrt(max(0.0, 2 - 2 * rho)))
 
 
-def update(state: RecursiveState, frames: FloatArray, gap: bool, window: int) -> FloatArray:
+def update(
+    state: RecursiveState,
+    frames: FloatArray,
+    gap: bool,
+    window: int,
+    wide: int = 0,
+    principal: int = 0,
+) -> FloatArray:
     """Learn from consecutive frames of values; what `RecursiveFeature.update` returns."""
     out = np.full(len(frames), np.nan)
     for start in range(0, len(frames), PIECE):
         piece = frames[start : start + PIECE]
-        out[start + len(piece) - 1] = learn_piece(state, piece, gap and start == 0, window)
+        how = gap and start == 0, window, wide, principal
+        out[start + len(piece) - 1] = learn_piece(state, piece, *how)
     return out

@@ -180,12 +180,9 @@ class Candidate:
     @property
     def tested(self) -> FloatArray:
         """(J,) slowness of each output on frames before they were learned; NaN before any test."""
-        return np.array(
-            [
-                slowness_by_moments(derivative, square - mean * mean) if self.tests else math.nan
-                for mean, square, derivative in self._moments.T
-            ]
-        )
+        if not self.tests:
+            return np.full(len(self._last), np.nan)
+        return slowness_by_moments(self._moments[2], self.variance)
 
     @property
     def variance(self) -> FloatArray:
@@ -217,8 +214,9 @@ class Candidate:
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of the candidate's state by name; most are views, not copies."""
+        counters = self.blocks, self.tests, self._reference_age, self.sfa.is_wide
         arrays = {
-            "counters": np.array([self.blocks, self.tests, self._reference_age], dtype=np.int64),
+            "counters": np.array(counters, dtype=np.int64),
             "measures": np.array([self.change, self.improvement]),
             "errors": self.errors,
             "moments": self._moments,
@@ -235,11 +233,11 @@ class Candidate:
         Raises:
             ValueError: an array is missing or has a different shape or type.
         """
-        if len(arrays["sfa.variance"]) > len(self.sfa.state.variance):
+        if np.any(np.asarray(arrays.get("counters", ()))[3:]):
             self.sfa.widen()
         current = self.arrays
         overwrite(current, arrays)
-        self.blocks, self.tests, self._reference_age = current["counters"].tolist()
+        self.blocks, self.tests, self._reference_age, _ = current["counters"].tolist()
         self.change, self.improvement = current["measures"].tolist()
 
 

@@ -27,7 +27,7 @@ from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.outcomes import NO_PROGRESS, outcome_text
 from cdmisfa.core.signals import STATES, BlockSignals
-from cdmisfa.features.recursive import STORED_BEYOND_WIDE, STORED_PER_COMPONENT
+from cdmisfa.features.recursive import STORED_PER_COMPONENT
 from cdmisfa.modules import PRINCIPAL, SLOW, Module
 
 # Smallest test window in blocks, also if `learner.test_frames` holds fewer. Set by hand: the change
@@ -42,7 +42,7 @@ MONITOR_WINDOWS = 0.4
 
 # Version of the decision rules. Raise it if the rules decide differently for the same frames: runs
 # of another version are then neither resumed nor verified.
-DECISION_VERSION = 4
+DECISION_VERSION = 5
 
 # Counters of the learner: iterations, the next stream, consecutive blocks of that stream, and
 # consecutive iterations in which every stream was decided.
@@ -78,7 +78,7 @@ class ProgressLearner:
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
         self._streams = decisions.new_streams(len(spec.streams))
-        stored = max(STORED_PER_COMPONENT * config.components, config.wide + STORED_BEYOND_WIDE)
+        stored = max(STORED_PER_COMPONENT * config.components, config.wide)
         size = 8 * most * (stored + self._n_outputs + 4)
         self._candidates = Candidates(self._new_candidate, size)
         self.rule = RULES[config.attention]
