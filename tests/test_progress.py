@@ -41,13 +41,21 @@ CONFIG = ProgressConfig(components=8)
 
 
 @pytest.mark.parametrize(
-    ("power", "steps", "slowness", "expected"),
-    [(1, 1, 1, 0), (10, 1, 1, 1), (0.1, 1, 1, 1), (1, np.exp(1.6), 1, 1), (1, 1, np.exp(-0.8), 1)],
+    ("power", "steps", "expected"),
+    [
+        ([1], [1], 0),
+        ([10], [1], 1),
+        ([0.1], [1], 1),
+        ([1], [np.exp(1.6)], 1),
+        ([100, 1], [1, 1], 1),
+        ([10, 0.1], [1, 1], 1),
+        ([1, 1], [np.exp(1.6), np.exp(-1.6)], 1),
+    ],
 )
 def test_the_novelty_is_1_at_each_limit(
-    power: float, steps: float, slowness: float, expected: float
+    power: list[float], steps: list[float], expected: float
 ) -> None:
-    assert novelty(power, steps, slowness) == pytest.approx(expected)
+    assert novelty(power, steps) == pytest.approx(expected)
 
 
 @given(st.floats(-3, 3), st.floats(-3, 3))
@@ -57,7 +65,7 @@ def test_a_stream_has_changed_where_the_novelty_is_above_1(size: float, speed: f
     for _ in range(5):
         monitor_output(row, y, 20)
     ratio = np.mean(np.diff(y) ** 2) / (2 * np.pi * 0.01) ** 2
-    assert output_changed(row, 20) == (novelty(float(np.mean(y * y)), float(ratio)) > 1)
+    assert output_changed(row, 20) == (novelty([float(np.mean(y * y))], [float(ratio)]) > 1)
 
 
 def learned_from(source: MovingPictures, seed: int = 0, **settings: Any) -> ProgressLearner:

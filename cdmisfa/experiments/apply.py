@@ -30,7 +30,6 @@ from cdmisfa.core.names import kind_of_frames
 from cdmisfa.core.processes import thread_count
 from cdmisfa.experiments.sources import configure, is_scene, open_logs
 from cdmisfa.features.following import SlownessSums
-from cdmisfa.features.outputs import slowness_by_moments
 from cdmisfa.modules import Module, Stack, columns_of
 from recorder.cameras.words import is_live, open_live
 from recorder.images.framing import Recipe
@@ -279,43 +278,43 @@ class _ModuleTracker:
 
     A module explains a block if the novelty is at most 1, the bound of the learner. For modules of
     1.0 and 2.0 that is the band of the slowness within the block, as in `gate.c`. For those of the
-    progress learner it is `decisions.novelty` of the first output, over the window of its tests
-    and relative to training, where its variance was 1 and its slowness eta.
+    progress learner it is `decisions.novelty` of all outputs, over the window of its tests and
+    relative to training, where the variance of an output was 1 and its slowness eta.
     """
 
     def __init__(self, modules: Sequence[Module], window: int) -> None:
         self._window = window
-        self._firsts = [columns.start for _, columns in columns_of(modules)]
+        self._columns = [columns for _, columns in columns_of(modules)]
+        self._firsts = [columns.start for columns in self._columns]
         self._centre = np.concatenate([module.band_mean for module in modules])
         self._width = EXPLAINED_WITHIN_SD * np.concatenate([module.band_sd for module in modules])
-        self._etas = {
-            i: float(module.eta[0])
+        self._steps = {  # mean squares of the differences of the outputs in training
+            i: (2 * math.pi * module.eta) ** 2
             for i, module in enumerate(modules)
             if not np.isfinite(module.band_sd).all()
         }
-        self._moments = np.zeros((3, len(modules)))
+        self._moments = np.zeros((3, len(self._centre)))
         self._frames = 0
 
     def update(self, block: Block, y: FloatArray) -> Applied:
         """Return the outputs (n, R) on a block with their slowness, liveness and novelty."""
         slowness, novelty = np.full(y.shape[1], np.nan), np.full(len(self._firsts), np.nan)
         if len(y) > 1:
-            slowness, first = kernels.instantaneous_slowness(y), y[:, self._firsts]
-            squares = [first * first, np.diff(first, axis=0) ** 2]
+            slowness = kernels.instantaneous_slowness(y)
+            squares = [y * y, np.diff(y, axis=0) ** 2]
             self._frames += len(y)
             rate = max(min(2 * len(y) / (self._window + len(y)), 1.0), len(y) / self._frames)
-            now = np.stack([values.mean(axis=0) for values in (first, *squares)])
+            now = np.stack([values.mean(axis=0) for values in (y, *squares)])
             self._moments += rate * (now - self._moments)
             with np.errstate(invalid="ignore"):  # an output can be infinitely fast here and there
                 distance = np.abs(slowness - self._centre) / self._width
             novelty = np.maximum.reduceat(distance, self._firsts)
         mean, power, steps = self._moments
-        variance = power - mean * mean
+        variance = (power - mean * mean)[self._firsts]
         low, high = decisions.MODULE_VARIANCE_BOUNDS
-        for i, eta in self._etas.items() if len(y) > 1 else ():
-            ratio = steps[i] / (2 * math.pi * eta) ** 2
-            relative = float(slowness_by_moments(steps[i], variance[i])) / eta
-            novelty[i] = decisions.novelty(power[i], ratio, relative)
+        for i, trained in self._steps.items() if len(y) > 1 else ():
+            at = self._columns[i]
+            novelty[i] = decisions.novelty(power[at].tolist(), (steps[at] / trained).tolist())
         return Applied(block, y, slowness, (low < variance) & (variance < high), novelty)
 
 

@@ -330,24 +330,22 @@ def output_changed(row: Any, window: int) -> bool:
     power, steps = float(row["power"] / row["then_power"]), float(row["steps"] / row["then_steps"])
     if row["watched"] < MIN_REJECTION_WINDOWS * window:
         return False
-    return not novelty(power, steps) <= 1.0
+    return not novelty([power], [steps]) <= 1.0
 
 
-def novelty(power: float, steps: float, slowness: float = 1.0) -> float:
-    """Return how far a module's output is from its output in training; above 1 it has changed.
+def novelty(power: Sequence[float], steps: Sequence[float]) -> float:
+    """Return how far a module's outputs are from those in training; above 1 they have changed.
 
-    The arguments are recent averages divided by the averages in training. The value is 1 where the
-    power reaches `MODULE_VARIANCE_BOUNDS`, or where the speed of the output, absolute or relative
-    to its variation, reaches `CHANGED_SLOWNESS_LOG`.
-
-    Args:
-        power: ratio of the mean squares.
-        steps: ratio of the mean squares of the differences.
-        slowness: ratio of the slownesses; 1 if it is not measured.
+    The arguments are recent averages divided by the averages in training, for one or more outputs.
+    The value is 1 where the power differs by `MODULE_VARIANCE_BOUNDS`, or the speed by
+    `CHANGED_SLOWNESS_LOG`, in the mean of the logarithms over the outputs.
     """
-    speed = max(0.5 * abs(log_ratio(steps, 1.0)), abs(log_ratio(slowness, 1.0)))
+    power_log, steps_log = (
+        sum(abs(log_ratio(ratio, 1.0)) for ratio in ratios) / len(ratios)
+        for ratios in (power, steps)
+    )
     widest = log_ratio(MODULE_VARIANCE_BOUNDS[1], 1.0)
-    return max(abs(log_ratio(power, 1.0)) / widest, speed / CHANGED_SLOWNESS_LOG)
+    return max(power_log / widest, 0.5 * steps_log / CHANGED_SLOWNESS_LOG)
 
 
 def outcomes(
