@@ -52,8 +52,9 @@ NOTE = (
     "frames, or on 200 or 50 of them, spread evenly. `8 slow of 16`: a module of 8 slow features "
     "of 16 components; `module`: one of 8 slow features and 8 principal components. Modules stop "
     "learning when the stream is decided; the other features use all frames to learn from. Each "
-    f"row is the mean over the seeds {SEEDS[0]} and {SEEDS[1]}; the last rows are the mean of the "
-    "rows and its 95 % interval over streams (bootstrap). No decision used these streams or seeds. "
+    f"row is the mean over the seeds {SEEDS[0]} and {SEEDS[1]}; the first table has the means of "
+    "the rows and their 95 % intervals over streams (bootstrap). No decision used these "
+    "streams or seeds. "
     "A stream without a module counts 0. Known: share of the blocks of the training frames on "
     "which `apply` gives a novelty of at most 1. AUROC: probability that novelty is higher in a "
     "block of another scene than in a block of the stream's own last quarter."
@@ -145,11 +146,40 @@ def interval(values: FloatArray) -> str:
     return f"[{low:.2f}, {high:.2f}]"
 
 
-def summary(table: FloatArray) -> list[list[str]]:
-    """Return the last rows of a table (streams, columns): mean and interval of each column."""
-    known = [column[np.isfinite(column)] for column in table.T]
-    means = [f"{column.mean():.3f}" for column in known]
-    return [["mean", *means], ["95 %", *map(interval, known)]]
+def interval_text(values: FloatArray) -> str:
+    """Return the mean of the values that are known, and its interval."""
+    known = values[np.isfinite(values)]
+    return f"{known.mean():.3f} {interval(known)}"
+
+
+def tables_of(names: Sequence[str], kinds: Sequence[str], R2: FloatArray, novelty: FloatArray
+              ) -> list[Any]:  # fmt: skip
+    """Return the tables: means, then a row for each stream.
+
+    Args:
+        names: the streams.
+        kinds: the features.
+        R2: (streams, kinds, labels).
+        novelty: (streams, 2) share known, and AUROC.
+    """
+    R2, novelty = R2.round(3), novelty.round(3)
+    module, means, parts = kinds.index("module"), list[list[str]](), []
+    for place, labels in enumerate(LABELS):
+        table = R2[:, :, place]
+        more = table[:, [module]] - table
+        text = f"{labels or 'all'} labels"
+        means.append([text, *map(interval_text, table.T)])
+        gains = ["" if k == module else interval_text(gain) for k, gain in enumerate(more.T)]
+        means.append([f"{text}, module minus", *gains])
+        parts.append(([f"stream, {text}", *kinds], _rows(names, table)))
+    known = [interval_text(column) for column in novelty.T]
+    ends = (["stream", "known", "AUROC"], [*_rows(names, novelty), ["mean", *known]])
+    return [(["R2", *kinds], means), *parts, ends]
+
+
+def _rows(names: Sequence[str], table: FloatArray) -> list[list[str]]:
+    rows = [[f"{value:.3f}" for value in row] for row in table]
+    return [[name, *row] for name, row in zip(names, rows, strict=True)]
 
 
 def main(*, quick: bool = False) -> None:
@@ -162,16 +192,12 @@ def main(*, quick: bool = False) -> None:
             others = [footage[names[(k + i) % len(names)]] for i in range(1, OTHERS + 1)]
             found[name].append(measure(footage[name], others))
             print(seed, name, found[name][-1], flush=True)
-    tables = []
     kinds = [kind for kind in found[names[0]][0] if kind not in ("known", "AUROC")]
-    values = {name: {kind: np.mean([row[kind] for row in rows], axis=0) for kind in rows[0]}
-              for name, rows in found.items()}  # fmt: skip
-    for place, labels in enumerate(LABELS):
-        table = np.array([[row[kind][place] for kind in kinds] for row in values.values()])
-        rows = [[name, *(f"{x:.3f}" for x in row)] for name, row in zip(names, table, strict=True)]
-        head = [f"stream, {labels or 'all'} labels", *kinds]
-        tables.append((head, rows + summary(table)))
-    ends = np.array([[row["known"][0], row["AUROC"][0]] for row in values.values()])
-    rows = [[name, *(f"{x:.3f}" for x in row)] for name, row in zip(names, ends, strict=True)]
-    tables.append((["stream", "known", "AUROC"], rows + summary(ends)))
+
+    def over_seeds(*columns: str) -> FloatArray:
+        rows = [[[row[kind] for kind in columns] for row in found[name]] for name in names]
+        return np.mean(rows, axis=1)
+
+    novelties = over_seeds("known", "AUROC")[:, :, 0]
+    tables = tables_of(names, kinds, over_seeds(*kinds), novelties)
     save("features", "What can be read from features", NOTE, tables)

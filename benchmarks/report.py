@@ -155,6 +155,15 @@ PARTS = {
         "IncrementalPCA does not look for slow features.",
         (0, 1, 2, 3, 4, 5),
     ),
+    "features": Part(
+        "What can be read from features",
+        "R2 of the true state by ridge regression from features of one frame, fitted with all, 200 "
+        "or 50 labels and judged on following frames: means of 16 streams that no decision used, "
+        "with 95 % intervals over streams. `module minus`: paired differences. PC: principal "
+        "components; they and batch SFA use all frames to learn from, while a module stops when "
+        "its stream is decided. With all labels 64 components are best, with fewer batch SFA.",
+        (0, 1, 2, 3, 4, 5, 6, 7),
+    ),
     "dots": Part(
         "A moving dot in noise",
         "Error of the position of a dot, in image widths, read from features of one image by ridge "

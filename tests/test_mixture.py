@@ -1,4 +1,4 @@
-"""Modules of slow features and principal components: known answers, files, and who pays for them."""
+"""Modules of slow features and principal components: known answers, files, and their cost."""
 
 from __future__ import annotations
 
@@ -91,8 +91,8 @@ def test_widening_changes_the_other_outputs_only() -> None:
 
 
 def test_sizes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(UsageError, match="5 principal outputs"):
-        RecursiveFeature(20, 4, principal=5)
+    with pytest.raises(UsageError, match="-1 principal outputs"):
+        RecursiveFeature(20, 4, principal=-1)
 
 
 def test_the_estimator_has_principal_components_after_its_slow_features() -> None:

@@ -25,8 +25,8 @@ SIGNALS: Mapping[str, str] = {
     "2.0": "ab36b99cbf97e81d3a54de409e1888e135f3fa9dfb5e0eaa67665d4b73c27054",
     "2.0 of images": "13c67daef9667811a65994187d9e1aa32e49f7378de6031f985bc4e8ab782b5a",
     "1.0": "4182be146ff6de3c252ac219f1104fb955030c7f78e3ed09e50b7a4cf65c376a",
-    "progress": "fb42c26e3f841c15f6b6dfab3a561e3995a41e6e41c020c1d5ae8c5687a7ff02",
-    "progress of images": "5311c3d8c5f78faddbf202ed0fa5bbadce4e55cb6c29916a1ad5481e7c33af28",
+    "progress": "9a69eaa79a2e5f1cf02d88d20bbd089638b5a2ef39c492ba43bcce0480b294f0",
+    "progress of images": "094bb2bef1f4ec753d22af375ebfc4dd0aca8b2d1196c508d9051ca2c30f211d",
 }
 """Of 20 iterations on the oscillatory streams, and of 2 on images, with seed 3."""
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from sources import PRODUCT, ROOT, files, name, tree
 
 CEILINGS = {
-    "benchmarks": 3990,
-    "cdmisfa": 300,
-    "cdmisfa/agents": 1195,
+    "benchmarks": 4130,
+    "cdmisfa": 315,
+    "cdmisfa/agents": 1225,
     "cdmisfa/cli": 2165,
     "cdmisfa/core": 1230,
-    "cdmisfa/estimators": 250,
+    "cdmisfa/estimators": 270,
     "cdmisfa/experiments": 2290,
-    "cdmisfa/features": 230,
+    "cdmisfa/features": 270,
     "cdmisfa/kernels": 2390,
     "cdmisfa/public": 380,
     "cdmisfa/studies": 940,
@@ -38,7 +38,7 @@ CEILINGS = {
     "replay/runs": 1410,
     "replay/storage": 290,
     "replay/view": 1960,
-    "tests": 19760,
+    "tests": 19900,
     "tools": 2080,
 }
 """Code lines allowed in each package: what it had when the ceiling was set, and 5 percent."""

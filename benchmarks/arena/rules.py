@@ -53,7 +53,7 @@ def prediction_error(frames: NDArray[Any], candidate: Candidate) -> float:
     1 for white noise, which nothing predicts, and 0 for a constant.
     """
     y = candidate.y[np.isfinite(candidate.y).all(axis=1)]
-    fitted = candidate.sfa.state.spectrum[: y.shape[1]]
+    fitted = candidate.sfa.output_slowness
     if len(y) < 2 or not np.isfinite(fitted).all():
         return 1.0
     rho = np.maximum(1.0 - 2.0 * (np.pi * fitted) ** 2, -1.0)

@@ -107,8 +107,8 @@ class BlockSignals:
         saved: Whether a module was saved at the end of the block.
         share: Recent share of blocks that were novel and of the same stream as the block before.
         novel_blocks: Number of novel blocks since the last module was saved.
-        y: Output of the features being learned, on the block: of the slow ones, then of the
-            principal components.
+        y: Outputs of the features being learned, on the block: slow features, then principal
+            components.
         y_frozen: Output of each saved module on the block; NaN for modules that learned from frames
             of another shape or type, which the block cannot have.
         eta: Slowness of each output.

@@ -78,8 +78,8 @@ class RecursiveFeature:
     """Slow feature analysis of all frames so far, updated block by block.
 
     The outputs are the slowest feature of the leading K components, then the other slow features,
-    then principal components with variance 1. After `widen` the other slow features are those of
-    more components that are uncorrelated with the first.
+    then principal components with variance 1. After `widen` the other slow features come from more
+    components and are uncorrelated with the first.
 
     If the frames vary in at most 2 K directions, no direction is dropped and the result does not
     depend on how the frames are cut into calls, up to rounding.
@@ -89,8 +89,8 @@ class RecursiveFeature:
         components: number of whitened principal components K; 2 K are stored.
         outputs: number of slow features.
         window: exponential window (frames); the first `window` frames have equal weights.
-        principal: number of principal components among the outputs.
-        wide: number of components after `widen`, of which as many are stored, or 2 K.
+        principal: number of principal components among the outputs, at most K.
+        wide: number of components after `widen`; as many directions are stored, or 2 K.
 
     Attributes:
         state: the arrays of the state; write into them to restore another state.
@@ -114,12 +114,11 @@ class RecursiveFeature:
         principal: int = 0,
         wide: int = 0,
     ) -> None:
-        fits = 1 <= outputs <= components and 0 <= principal <= components
-        if n_inputs < 1 or not fits or window < 1:
+        if min(n_inputs, outputs, window) < 1 or outputs > components or principal < 0:
             raise UsageError(
                 f"no SFA has {n_inputs} inputs, {components} components, {outputs} outputs, "
-                f"{principal} principal outputs and a window of {window}: set each to at least 1, "
-                "and outputs to at most components"
+                f"{principal} principal outputs and a window of {window}: set all but the principal "
+                "outputs to at least 1, and outputs to at most components"
             )
         size = min(STORED_PER_COMPONENT * components, n_inputs)
         components = min(components, n_inputs)

@@ -330,8 +330,8 @@ def recursive_state(
 ) -> Struct:
     """Return a state of recursive SFA as C takes it; see `RecursiveState`.
 
-    The slow outputs after the first are those of `wide` components, if that is more than those of
-    the spectrum; the last `principal` outputs are principal components.
+    The slow outputs after the first use `wide` components, if that is more than the spectrum has;
+    the last `principal` outputs are principal components.
     """
     (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
     components = len(arrays["spectrum"])

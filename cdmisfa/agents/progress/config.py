@@ -21,7 +21,8 @@ class ProgressConfig(Section):
         components: number of principal components that are whitened for each stream. The learner
             tracks twice as many. Decisions use the slowest feature of these.
         outputs: number of slow features of a module.
-        principal: number of principal components of a module, after its slow features.
+        principal: number of principal components of a module, after its slow features; at most
+            `components` are used.
         wide: number of components of the slow features after the first, from the moment at which
             a stream promises to be learned; at most `components`: no more than these.
         expansion: `none`, `quadratic` to add all products of two inputs, or `auto`: quadratic if
@@ -47,7 +48,7 @@ class ProgressConfig(Section):
     tau: int = key(40, 3, MAX_TAU)
     components: int = key(16, 1, MAX_COMPONENTS)
     outputs: int = key(8, 1, "components")
-    principal: int = key(8, 0, "components")
+    principal: int = key(8, 0, MAX_COMPONENTS)
     wide: int = key(48, 0, MAX_COMPONENTS)
     expansion: str | None = None
     window: int = key(8000, 1)

@@ -51,7 +51,7 @@ class FrameKinds:
         self._inputs = {kind: StreamInputs.of(*kind, config) for kind in spec.every_kind}
         self.most_inputs = max(inputs.size for inputs in self._inputs.values())
         self.slow = min(config.outputs, self.most_inputs)
-        self.outputs = self.slow + min(config.principal, self.most_inputs)
+        self.outputs = self.slow + min(config.principal, config.components, self.most_inputs)
 
     def inputs(self, stream: int) -> StreamInputs:
         """Return how frames of a stream become inputs."""
