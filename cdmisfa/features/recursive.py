@@ -117,8 +117,8 @@ class RecursiveFeature:
         if min(n_inputs, outputs, window) < 1 or outputs > components or principal < 0:
             raise UsageError(
                 f"no SFA has {n_inputs} inputs, {components} components, {outputs} outputs, "
-                f"{principal} principal outputs and a window of {window}: set all but the principal "
-                "outputs to at least 1, and outputs to at most components"
+                f"{principal} principal outputs and a window of {window}: set all but "
+                "the principal outputs to at least 1, and outputs to at most components"
             )
         size = min(STORED_PER_COMPONENT * components, n_inputs)
         components = min(components, n_inputs)
