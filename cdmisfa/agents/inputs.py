@@ -20,8 +20,8 @@ from cdmisfa.core.signals import DENSE_STREAMS, NO_STATE, SIGNALS, BlockSignals
 # Largest absolute value of a frame: squares of such values, and their sums, stay finite in float64.
 LARGEST_VALUE = 1e100
 
-# Largest number of inputs, a gray image of 1400 x 1400. A progress learner with 16 components then
-# takes 0.7 GB for each candidate.
+# Largest number of inputs, a gray image of 1400 x 1400. A progress learner then takes up to
+# 1.1 GB for each candidate.
 MAX_INPUTS = 2_000_000
 
 
