@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import hashlib
 import json
 import os
@@ -34,6 +35,10 @@ from replay.storage.paths import natural_order, no_such
 
 # Increased whenever a measure changes, so that stored ones are not used any more.
 VERSION: Final = 1
+
+# Images between two collections: PyAV's images are freed by the collector only, and each of them is
+# so few objects that it does not run by itself.
+COLLECT_EVERY: Final = 64
 
 # Formats of logs with topics.
 _WITH_TOPICS: Final = ("mcap", "split", "bag")
@@ -156,11 +161,11 @@ def open_cameras(log: EpisodeLog, opened: ExitStack) -> dict[str, LogStream]:
         if format != "dataset" or lerobot.features(path)[1]:
             topics = ALL if format in (*_WITH_TOPICS, "dataset") else ()
             with suppress(NoTopicError):
-                streams += FORMATS[format](path, InputOptions(topics=topics, color=True), opened)
+                streams += _streams(log, path, format, opened, topics=topics, color=True)
     # A file without topics is named by itself, but its camera is the same in all episodes.
     alone = format in ("video", "images")
     names = ("camera",) if alone else stream_names([stream.topic for stream in streams])
-    return dict(zip(names, (_of_episode(log, stream) for stream in streams), strict=True))
+    return dict(zip(names, streams, strict=True))
 
 
 def read_numbers(log: EpisodeLog, opened: ExitStack) -> dict[str, Rows]:
@@ -190,11 +195,11 @@ def read_numbers(log: EpisodeLog, opened: ExitStack) -> dict[str, Rows]:
 
 def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: ExitStack) -> Rows:
     topic, _, field = word.partition(":")
-    options = InputOptions(topics=(topic,), fields=(field or "position",))
     if format == "dataset":
-        options = InputOptions(fields=(word,))
-    (whole,) = FORMATS[format](path, options, opened)
-    stream = _of_episode(log, whole)
+        (stream,) = _streams(log, path, format, opened, fields=(word,))
+    else:
+        fields = (field or "position",)
+        (stream,) = _streams(log, path, format, opened, topics=(topic,), fields=fields)
     if stream.read is not None:
         return seconds(stream), np.asarray(stream.read(range(stream.count))[0], np.float64)
     rows, values = list[int](), list[Any]()
@@ -210,11 +215,25 @@ def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: Exi
     return seconds(stream)[rows], np.stack(values)
 
 
-def _of_episode(log: EpisodeLog, stream: LogStream) -> LogStream:
-    if log.number < 0 or stream.times is None:
-        return stream
+def _streams(
+    log: EpisodeLog, path: Path, format: Format, opened: ExitStack, **options: Any
+) -> list[LogStream]:
+    """Open streams of a file of an episode; of a dataset, the rows of the episode."""
+    chosen = InputOptions(**options)
+    if format != "dataset":
+        return FORMATS[format](path, chosen, opened)
+    streams = _of_dataset_once(path, log.state, chosen)
     rows = np.arange(log.first, log.first + log.count)
-    return stream.part(rows, stream.times[rows])
+    return [stream.part(rows, stream.times[rows]) for stream in streams if stream.times is not None]
+
+
+@functools.lru_cache(maxsize=8)
+def _of_dataset_once(path: Path, state: tuple[int, str], options: InputOptions) -> list[LogStream]:
+    """Open streams of a LeRobot dataset once for all of its episodes, until the process ends.
+
+    Its tables are those of all episodes, and so are the numbers in them.
+    """
+    return FORMATS["dataset"](path, options, ExitStack())
 
 
 def measure_episode(log: EpisodeLog) -> Measured:
@@ -252,7 +271,9 @@ def _measure(
     measured.numbers = {kind: (t - zero, values) for kind, (t, values) in measured.numbers.items()}
     meters = {name: CameraMeter(times - zero) for name, times in clocks.items()}
     rows = [(time, name, row) for name, t in clocks.items() for row, time in enumerate(t.tolist())]
-    for time, name, row in sorted(rows, key=lambda one: one[0]):
+    for place, (time, name, row) in enumerate(sorted(rows, key=lambda one: one[0])):
+        if place % COLLECT_EVERY == 0:
+            gc.collect()
         try:
             meters[name].add(row, cameras[name].image(row))
         except BROKEN as error:
