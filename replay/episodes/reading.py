@@ -137,13 +137,13 @@ def _is_whole(folder: str) -> bool:
 
 def _of_dataset(log: EpisodeLog, prefix: str) -> Iterator[EpisodeLog]:
     """Yield the episodes of a LeRobot dataset."""
-    first = 0
-    rows, missing = lerobot.episode_facts(location(log.files[0]))
-    left = f"{log.files[0]}: {missing}" if missing else ""
-    for row in rows:
+    first, dataset = 0, lerobot.Dataset(location(log.files[0]))
+    left = f"{log.files[0]}: {dataset.missing}" if dataset.missing else ""
+    for row in dataset.rows:
         length, number = int(row.pop("length")), int(row.pop("episode_index"))
         row["task"] = "; ".join(map(str, row.pop("tasks", None) or []))
         about = {k: str(v) for k, v in row.items() if isinstance(v, str | int) and v != ""}
+        about = {k: v for k, v in about.items() if "/" not in k and not k.startswith("dataset_")}
         name, place = f"{prefix}episode {number}", (number, first, length)
         yield EpisodeLog(name, log.files, log.state, about, *place, topics=log.topics, missing=left)
         first += length

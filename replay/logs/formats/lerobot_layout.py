@@ -32,13 +32,6 @@ NO_FOOTER = "is missing or has no footer, so its rows are lost"
 Stats = dict[str, NDArray[Any]]
 
 
-def place_columns(info: Mapping[str, Any]) -> list[str]:
-    """Return the columns in the tables of episodes that state the files of an episode."""
-    videos = [column for camera in video_cameras(info) for column in _columns(camera)]
-    starts = [f"videos/{camera}/from_timestamp" for camera in video_cameras(info)]
-    return [*_columns(""), *videos, *starts]
-
-
 def _columns(camera: str) -> list[str]:
     kind = f"videos/{camera}" if camera else "data"
     return [f"{kind}/chunk_index", f"{kind}/file_index"]
