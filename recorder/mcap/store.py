@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted import open_regular
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.untrusted import file_number
 from recorder.mcap.records import crc32
 
 # Ending of the name of a file that is being written, or whose writing was interrupted.
@@ -46,11 +46,8 @@ class Store:
         Raises:
             UsageError: the file cannot be opened.
         """
-        try:
-            number = open_regular(path)
-            self._status = os.fstat(number)
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
+        number = file_number(path)
+        self._status = os.fstat(number)
         self.path, self.size = path, self._status.st_size
         self._window, self._window_at = b"", 0
         self._kept: dict[int, bytes] | None = None

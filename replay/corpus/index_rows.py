@@ -22,7 +22,7 @@ from replay.integrity.listing import ListedLog, size_and_time
 from replay.integrity.report import failed
 from replay.logs.clock import missing
 from replay.logs.formats.lerobot import LAYOUT as DATASET
-from replay.logs.health import COLUMNS, Health, seconds
+from replay.logs.health import COLUMNS, Health
 from replay.logs.open_logs import identity_of, image_topics, is_external_format, open_stream
 from replay.logs.stream import ChannelInfo
 from replay.storage.identity import Identity, McapIdentity
@@ -180,7 +180,7 @@ def _decoded(place: Path, topic: str) -> dict[str, Any]:
             if stream.program == DATASET:  # it pauses between episodes, where nothing is missing
                 gaps = 0
             health = Health()
-            for row, time in enumerate(seconds(stream).tolist()):
+            for row, time in enumerate(stream.seconds().tolist()):
                 try:
                     health.add(time, functools.partial(stream.image, row))
                 except MalformedRecord:

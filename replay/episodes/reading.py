@@ -25,9 +25,8 @@ from replay.integrity.info import describe_log
 from replay.integrity.listing import ListedLog, find_logs
 from replay.logs.formats import lerobot
 from replay.logs.formats.messages import NoTopicError
-from replay.logs.health import RATE, seconds
 from replay.logs.open_logs import ALL, FORMATS, Format, log_format
-from replay.logs.stream import BROKEN, LogStream
+from replay.logs.stream import BROKEN, RATE, LogStream
 from replay.open_sources import is_recording, locations
 from replay.runs.folders import is_run
 from replay.storage.location import is_url, location
@@ -201,7 +200,7 @@ def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: Exi
         fields = (field or "position",)
         (stream,) = _streams(log, path, format, opened, topics=(topic,), fields=fields)
     if stream.read is not None:
-        return seconds(stream), np.asarray(stream.read(range(stream.count))[0], np.float64)
+        return stream.seconds(), np.asarray(stream.read(range(stream.count))[0], np.float64)
     rows, values = list[int](), list[Any]()
     for row in range(stream.count):
         with suppress(*BROKEN):
@@ -212,7 +211,7 @@ def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: Exi
             f"{path}: {topic} has a changing number of values: choose a part of "
             f"them, as in --state {topic}:position[0:6]"
         )
-    return seconds(stream)[rows], np.stack(values)
+    return stream.seconds()[rows], np.stack(values)
 
 
 def _streams(
@@ -261,7 +260,7 @@ def _measure(
             measured.remarks.append(f"{left}: they are left out")
         if whole.any():
             measured.numbers[kind] = times[whole], values[whole]
-    clocks = {name: seconds(stream) for name, stream in cameras.items()}
+    clocks = {name: stream.seconds() for name, stream in cameras.items()}
     every = [*clocks.values(), *(times for times, _ in measured.numbers.values())]
     if not every:
         raise UsageError(f"{measured.name}: no images and no joint states were found")

@@ -26,7 +26,7 @@ from replay.integrity.report import LogReport, State, as_problem, combined, fail
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
 from replay.logs.formats.recording import ViewFile
-from replay.logs.health import Health, seconds
+from replay.logs.health import Health
 from replay.logs.open_logs import (
     channels_of,
     image_topics,
@@ -345,7 +345,7 @@ def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ())
         try:
             with open_stream(path, topic) as stream:
                 measured = health.setdefault(topic, Health())
-                for row, time in enumerate(seconds(stream).tolist()):
+                for row, time in enumerate(stream.seconds().tolist()):
                     try:
                         measured.add(time, functools.partial(stream.image, row))
                     except LogDamagedError as error:

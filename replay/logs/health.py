@@ -11,14 +11,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
 from recorder.images.pixels import HIGH_BYTE, Content, losses
-from replay.logs.stream import LogStream
 
 # Brightness below which a pixel is black, and above which it is saturated.
 BLACK: Final = 16
 WHITE: Final = 250
-
-# Images per second of a stream that states no times.
-RATE: Final = 30.0
 
 # Largest width of the grid of pixels that is compared. Pixels are not averaged: the sensor noise,
 # which tells a frozen image from a scene at rest, would vanish.
@@ -144,10 +140,3 @@ def _jumps(far: FloatArray, same: NDArray[np.bool_], first: int, stop: int) -> b
     moves = np.concatenate([far[part][~same[part]] for part in near])
     after = far[stop : stop + 3].max(initial=0)  # a codec may show the motion two images later
     return bool(len(moves) >= _LEAST and after > 2.5 * np.quantile(moves, 0.75) + 0.01)
-
-
-def seconds(stream: LogStream) -> FloatArray:
-    """Return the time of each row of a stream (s)."""
-    if stream.times is None:
-        return np.arange(stream.count) / RATE
-    return np.asarray(stream.times / 1e9, np.float64)
