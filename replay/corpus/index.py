@@ -319,12 +319,10 @@ def _logs_by_path(words: Sequence[str | Path], index: Path) -> dict[str, ListedL
 
 def _known_states(table: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
     """Return size and time of change of the logs in an index; with `deep`, of decoded logs."""
-    decoded = pc.or_(table["deep"], not deep)
-    known = table.filter(pc.and_(pc.not_equal(table["changed"], ""), decoded))
+    rows = table.select(["path", "bytes", "changed", "deep", "state"]).to_pylist()
     # A log that was not read may be readable now, as when the missing package is installed.
-    known = known.filter(pc.not_equal(pc.fill_null(known["state"], ""), "not read"))
-    columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))
-    return {path: (size, changed) for path, size, changed in zip(*columns, strict=True)}
+    known = (row for row in rows if row["changed"] and row["state"] != "not read")
+    return {r["path"]: (r["bytes"], r["changed"]) for r in known if r["deep"] or not deep}
 
 
 def _write(tables: Sequence[pa.Table], index: Path) -> pa.Table:

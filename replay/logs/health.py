@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.errors import LogDamagedError
 from recorder.images.pixels import HIGH_BYTE, Content, losses
+from replay.logs.stream import LogStream
 
 # Brightness below which a pixel is black, and above which it is saturated.
 BLACK: Final = 16
@@ -117,6 +120,15 @@ class Health:
             if share >= 0.01 or share * len(self._times) >= _LEAST:
                 parts.append(f"{100 * share:.1f} % of the images are {name}")
         return "; ".join(parts)
+
+
+def broken_rows(stream: LogStream, health: Health) -> Iterator[tuple[int, LogDamagedError]]:
+    """Measure all images of a stream, and yield each row that is broken, with its error."""
+    for row, time in enumerate(stream.seconds().tolist()):
+        try:
+            health.add(time, partial(stream.image, row))
+        except LogDamagedError as error:
+            yield row, error
 
 
 def _shows_noise(
