@@ -50,7 +50,7 @@ class Store:
         self._status = os.fstat(number)
         self.path, self.size = path, self._status.st_size
         self._window, self._window_at = b"", 0
-        self._kept: dict[int, bytes] | None = None
+        self._reads: dict[int, bytes] | None = None
         # The finalizer also closes the file if nobody calls `close`.
         self._number, self._release = number, weakref.finalize(self, os.close, number)
 
@@ -78,13 +78,13 @@ class Store:
             parts.append(part)
             offset, count = offset + len(part), count - len(part)
         data = parts[0] if len(parts) == 1 else b"".join(parts)
-        if self._kept is not None and len(data) > _PEEK:
-            self._kept[offset - len(data)] = data
+        if self._reads is not None and len(data) > _PEEK:
+            self._reads[offset - len(data)] = data
         return data
 
     def keep_reads(self) -> None:
-        """Keep what is read until the next call of `crc`, so that a pass reads each byte once."""
-        self._kept = {}
+        """Keep the bytes read until the next call of `crc`, so that a pass reads each byte once."""
+        self._reads = {}
 
     def peek(self, offset: int, count: int) -> bytes:
         """Return at most `count` (few) bytes, and read ahead for further calls."""
@@ -103,15 +103,15 @@ class Store:
 
     def crc(self, offset: int, stop: int, value: int = 0) -> int:
         """Return the CRC-32 of the bytes [offset, stop) behind bytes with the CRC-32 `value`."""
-        kept, self._kept = self._kept, None
-        for start, data in sorted((kept or {}).items()):
+        reads, self._reads = self._reads, None
+        for start, data in sorted((reads or {}).items()):
             if offset <= start and start + len(data) <= stop:
                 for block in self.blocks(offset, start):
                     value = crc32(block, value)
                 value, offset = crc32(data, value), start + len(data)
         for block in self.blocks(offset, stop):
             value = crc32(block, value)
-        self._kept = None if kept is None else {}
+        self._reads = None if reads is None else {}
         return value
 
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:

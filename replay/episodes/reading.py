@@ -230,7 +230,7 @@ def _streams(
 def _of_dataset_once(path: Path, state: tuple[int, str], options: InputOptions) -> list[LogStream]:
     """Open streams of a LeRobot dataset once for all of its episodes, until the process ends.
 
-    Its tables are those of all episodes, and so are the numbers in them.
+    Its tables and the numbers in them belong to all episodes.
     """
     return FORMATS["dataset"](path, options, ExitStack())
 

@@ -111,7 +111,7 @@ class Health:
         return dict(zip(COLUMNS, rounded, strict=True))
 
     def remark(self) -> str:
-        """Return what is remarkable about the images, or ""."""
+        """Return a line about frozen, repeated, black and saturated images, or ""."""
         columns, parts = self.columns(), list[str]()
         if (at := columns.get("frozen_at")) is not None:
             parts.append(f"frozen for {columns['frozen_seconds']:.1f} s at {at:.1f} s")

@@ -100,7 +100,7 @@ def open_streams(
         UsageError: no log has a topic.
         LogDamagedError: a log is damaged; with `skip_damaged` all are.
     """
-    topics, found = options.topics, list[LogStream]()
+    topics, result = options.topics, list[LogStream]()
     logs: list[tuple[Path, LogReader | None]] = []
     patterns = any(letter in topic for topic in topics for letter in "*?[")
     in_turn = len(topics) == len(files) > 1 and not patterns
@@ -110,7 +110,7 @@ def open_streams(
         chosen = replace(options, topics=topics[i : i + 1]) if in_turn else options
         try:
             streams = FORMATS[log_format(file)](file, chosen, opened, skip_damaged=skip_damaged)
-            found += streams
+            result += streams
             logs.append((file, streams[0].reader))
         except NoTopicError as error:
             if in_turn or len(files) == 1 or not topics:
@@ -120,19 +120,19 @@ def open_streams(
             if not skip_damaged or len(files) == 1:
                 raise
             broken.append(error)
-    if not found:
+    if not result:
         raise [*refused, *broken][0]
     if topics and not in_turn:
         for topic in topics:
-            if not any(fits_topic(stream.topic, [topic]) for stream in found):
+            if not any(fits_topic(stream.topic, [topic]) for stream in result):
                 alone = replace(options, topics=(topic,))  # whose error names those there are
                 FORMATS[log_format(files[0])](files[0], alone, opened)
 
         def place(stream: LogStream) -> int:
             return [*(fits_topic(stream.topic, [t]) for t in topics), True].index(True)
 
-        found.sort(key=place)
-    return found, logs, [f"{error}: this log is skipped" for error in broken]
+        result.sort(key=place)
+    return result, logs, [f"{error}: this log is skipped" for error in broken]
 
 
 @contextlib.contextmanager
