@@ -20,7 +20,7 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import run_all
-from cdmisfa.core.untrusted import MAX_LIST, opened_regular, parse_json
+from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
 from cdmisfa.experiments.documents import writing
 from recorder.log.files import (
     locked_folder,
@@ -215,7 +215,7 @@ def read_trial_rows(folder: Path) -> Iterator[Row]:
 
     Raises:
         UsageError: rows.jsonl is not a regular file.
-        LogDamagedError: a line is damaged.
+        LogDamagedError: a line is damaged, or the rows take more memory than `budget`.
     """
     yield from _read(folder / ROWS)[0].values()
 
@@ -226,18 +226,26 @@ def _read(path: Path) -> tuple[dict[str, Row], int]:
     size = 0
     if not path.exists():
         return rows, size
-    with opened_regular(path) as file:
-        for number, line in enumerate(file, start=1):
-            if not line.endswith(b"\n"):
-                break
-            try:
-                row = parse_json(line, MAX_LIST)
-                row = {**row, "status": row["status"], "point": dict(row["point"])}
-                rows.pop(row["id"], None)  # so that the order is that of the last rows
-                rows[row["id"]] = row
-            except (ValueError, KeyError, TypeError) as error:
-                raise LogDamagedError(f"{path} line {number} is damaged: remove it") from error
-            size += len(line)
+    try:
+        with budget(), opened_regular(path) as file:
+            lines = iter(lambda: file.readline(MAX_LIST + 1), b"")
+            for number, line in enumerate(lines, start=1):
+                if not line.endswith(b"\n") and len(line) <= MAX_LIST:
+                    break
+                try:
+                    row = parse_json(line, MAX_LIST)
+                    row = {**row, "status": row["status"], "point": dict(row["point"])}
+                    rows.pop(row["id"], None)  # so that the order is that of the last rows
+                    rows[row["id"]] = row
+                except (ValueError, KeyError, TypeError) as error:
+                    raise LogDamagedError(f"{path} line {number} is damaged: remove it") from error
+                size += len(line)
+    except MemoryError:
+        rows.clear()
+        raise LogDamagedError(
+            f"{path}: its rows take more than {BUDGET >> 20} MiB of memory, the limit: "
+            "split the grid over several folders"
+        ) from None
     # A trial whose file was written again by another trial is no longer finished.
     writers = {Path(row["run"]).name: row["id"] for row in rows.values() if row.get("run")}
     current = {

@@ -163,6 +163,7 @@ class LogFile(McapWriter):
         """
         self.path = Path(path)
         self.partial = partial_path(self.path)
+        self._force = force
         self._flush_ns = flush_ns
         self._chunk_start: int | None = None
         self._named_on_disk = False
@@ -224,13 +225,22 @@ class LogFile(McapWriter):
             self._named_on_disk = True
 
     def finish(self) -> None:
-        """Write the index, sync the file, and give it its final name."""
+        """Write the index, sync the file, and give it its final name.
+
+        Raises:
+            UsageError: a file with that name was created meanwhile; the `.partial` stays.
+        """
         try:
             self._stream.check()
             self.end()
             self._stream.sync()
         finally:
             self._stream.close()
+        if not self._force and self.path.exists():
+            raise UsageError(
+                f"{self.path} was created by another program meanwhile: "
+                f"the new log is complete in {self.partial.name}: rename it"
+            )
         self._rename(self.path)
 
     def abandon(self) -> None:
