@@ -20,7 +20,7 @@ from replay.logs.formats import views
 from replay.logs.formats.arrays import array_streams
 from replay.logs.formats.recording import NoRecordingError, ViewFile
 from replay.logs.formats.views import SeveralRecordingsError
-from replay.logs.open_logs import ALL, OpenLogs, image_logs, is_external_format
+from replay.logs.open_logs import ALL, image_logs, is_external_format, open_streams
 from replay.logs.source import LoggedSource
 from replay.runs.folders import RUN_FILE, is_run
 from replay.storage.location import is_url, location
@@ -161,9 +161,10 @@ def open_external(
         return _with_color(lambda options: open_external(paths, options, **how), inputs)
     files = image_logs([paths] if isinstance(paths, str | Path) else paths)
     with ExitStack() as failed:
-        logs = OpenLogs(files, inputs, failed, skip_damaged=skip_damaged)
-        streams = logs.streams if inputs.align == "index" else join_parts(logs.streams)
-        how |= {"logs": logs.logs, "left_out": logs.left_out, "opened": failed.pop_all()}
+        streams, logs, left_out = open_streams(files, inputs, failed, skip_damaged=skip_damaged)
+        if inputs.align != "index":
+            streams = join_parts(streams)
+        how |= {"logs": logs, "left_out": left_out, "opened": failed.pop_all()}
         return LoggedSource(streams, inputs, **how)
 
 

@@ -16,6 +16,7 @@ from waiting import python
 from cdmisfa.cli import options
 from cdmisfa.cli.app import COMMANDS, cli
 from cdmisfa.cli.commands.learn import learn_command
+from cdmisfa.experiments.run_folder import words_of
 from recorder.images.options import OPTIONS, InputConfig, InputOptions
 
 
@@ -116,7 +117,9 @@ def test_the_words_of_settings_are_read_as_these_settings() -> None:
     def command(inputs: InputOptions) -> None:
         parsed.append(inputs)
 
-    command.main(chosen.words(), standalone_mode=False)
+    stated = {name: getattr(chosen, name) for name in OPTIONS}
+    words = words_of({**stated, "settings": tuple(chosen.settings())})
+    command.main(words, standalone_mode=False)
     command.main([], standalone_mode=False)
     assert parsed == [chosen, InputOptions()]
 

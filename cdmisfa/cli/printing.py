@@ -109,8 +109,7 @@ def source(frames: FrameSource) -> None:
         warning(text)
     for note in notes_of(frames):
         status(note)
-    kinds = {frames.spec.kind(i)[1] for i in range(len(frames.spec.streams))}
-    unit = "images" if kinds == {"uint8"} else "messages"
+    unit = _unit(frames)
     for name, counts in getattr(frames, "alignment", {}).items():
         status(
             f"{name}: {counts['messages']} {unit}, {counts['repeated']} frames repeated, "
@@ -126,8 +125,7 @@ def source_changes(frames: FrameSource) -> None:
         for text in warnings_of(frames)[len(getattr(frames, "warnings", ())) :]:
             warning(text)
         return
-    kinds = {frames.spec.kind(i)[1] for i in range(len(frames.spec.streams))}
-    unit = "images" if kinds == {"uint8"} else "messages"
+    unit = _unit(frames)
     for name, counts in getattr(frames, "alignment", {}).items():
         status(
             f"{name}: {counts['messages']} {unit}; frames: {counts['repeated']} repeated, "
@@ -137,6 +135,11 @@ def source_changes(frames: FrameSource) -> None:
 
 
 # Results of runs
+
+
+def _unit(frames: FrameSource) -> str:
+    images = all(dtype == "uint8" for _, dtype in frames.spec.every_kind)
+    return "images" if images else "messages"
 
 
 def result(run: RunResult, about: Mapping[str, Any] | None) -> None:

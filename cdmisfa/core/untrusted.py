@@ -119,10 +119,10 @@ def check_regular(path: Path, limit: int | None = None) -> None:
     Raises:
         UsageError: it is not, or it has more than `limit` bytes.
     """
-    os.close(_number_of(path, limit))
+    os.close(file_number(path, limit))
 
 
-def _number_of(path: Path, limit: int | None) -> int:
+def file_number(path: Path, limit: int | None = None) -> int:
     """Open a file as `open_regular` does; raise a UsageError if it cannot be opened."""
     try:
         return open_regular(path, limit)
@@ -148,7 +148,7 @@ def open_regular(path: Path, limit: int | None = None) -> int:
 @contextlib.contextmanager
 def opened_regular(path: Path, limit: int | None = None) -> Iterator[BinaryIO]:
     """Open a regular file for reading; raise errors as `read_regular`, also in the body."""
-    number = _number_of(path, limit)
+    number = file_number(path, limit)
     try:
         with open(number, "rb") as file:
             yield file

@@ -7,13 +7,13 @@ import functools
 import json
 import math
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import LogWriteError
 from recorder.log.files import atomic_write
+from recorder.log.files import writing as writing
 
 # Packages whose version can change a result.
 PACKAGES = ("cdmisfa", "numpy", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
@@ -83,15 +83,6 @@ def machine() -> dict[str, str]:
         "machine": platform.machine(),
         "libc": " ".join(platform.libc_ver()).strip(),
     }
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Convert an error of the operating system in the body to a LogWriteError about `path`."""
-    try:
-        yield
-    except OSError as error:
-        raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -106,16 +106,24 @@ def command_again(run: Path) -> str:
         source, options = read_command(run)
     except CdmisfaError:
         return ""
-    inputs = {name: options.pop(name) for name in INPUTS if name in options}
-    words = InputOptions(**inputs).words()
+    return shlex.join(["cdmisfa", "learn", *source, *words_of(options), "-o", "RUN"])
+
+
+def words_of(options: Mapping[str, Any]) -> list[str]:
+    """Return the words of a command line for the options of `command_of` that are not off."""
+    words: list[str] = []
+    flags = {"settings": "--set", **INPUTS}
     for name, value in options.items():
-        flag = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
-        if value is True:
-            words.append(flag)
-        elif value and not isinstance(value, bool):
-            for word in value if isinstance(value, tuple) else (value,):
-                words += [flag, str(word)]
-    return shlex.join(["cdmisfa", "learn", *source, *words, "-o", "RUN"])
+        flag = flags.get(name, f"--{name.replace('_', '-')}")
+        if name == "size" and value:
+            value = f"{value[1]}x{value[0]}"
+        elif name == "color" and value is True:
+            value = "on"
+        values = value if isinstance(value, tuple) else (value,)
+        for part in filter(None, values):
+            text = f"{part:g}" if isinstance(part, float) else str(part)
+            words += [flag] if part is True else [flag, text]
+    return words
 
 
 def log_to_resume(run: Path) -> Path:

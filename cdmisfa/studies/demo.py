@@ -39,14 +39,11 @@ SCORED_FRAMES = 4000
 Stage = Callable[[str, str], AbstractContextManager[Any]]
 
 
-def demo(
-    out: Path, *, preset: str | None = None, seed: int, frames: int, jobs: int, stage: Stage
-) -> dict[str, Any]:
+def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[str, Any]:
     """Record the scene, learn from the recording, compare with live, write the report.
 
     Args:
         out: folder in which `recordings/demo-icub` and `runs/demo-icub` are written or replaced.
-        preset: preset of scene and learner; by default `PRESET`, or the preset of the fallback.
         seed: seed of world and learner.
         frames: length of the recording, which the learner repeats.
         jobs: number of processes that render.
@@ -63,7 +60,7 @@ def demo(
 
     missing = [name for name in ("pybullet", "icub_models") if find_spec(name) is None]
     scene = FALLBACK_SCENE if missing else SCENE
-    preset = preset or (None if missing else PRESET)
+    preset = None if missing else PRESET
     configuration = configure(scene, Layers.read(preset), seed)
     recording, folder = out / "recordings" / f"demo-{scene}", out / "runs" / f"demo-{scene}"
 

@@ -187,19 +187,6 @@ class InputOptions(InputConfig):
             for name, v in chosen
         ]
 
-    def words(self) -> list[str]:
-        """Return the words of a command line for the settings that are not the defaults."""
-        words: list[str] = []
-        for name in self.chosen(OPTIONS):
-            value = getattr(self, name)
-            if name == "size":
-                value = f"{value[1]}x{value[0]}"
-            elif isinstance(value, float):
-                value = f"{value:g}"
-            for part in value if isinstance(value, tuple) else (value,):
-                words += [OPTIONS[name], "on" if part is True else str(part)]
-        return [*words, *(word for key in self.settings() for word in ("--set", key))]
-
 
 # Images, and no numbers.
 IMAGES: Final = InputOptions()

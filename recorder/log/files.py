@@ -120,6 +120,15 @@ def resolved_path(word: str, folder: Path) -> str:
 
 
 @contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Convert an error of the operating system in the body to a LogWriteError about `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path to write a file or folder at; at the end it gets its final name.
 
@@ -134,18 +143,17 @@ def atomic_write(path: Path) -> Iterator[Path]:
     refuse_special(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        make_folder(partial.parent)
-        _remove_leftovers(path)
-        _remove(partial)
-        yield partial
-        if partial.is_file():
-            to_disk(partial)
-        if path.is_dir() or partial.is_dir():
-            _remove(path)
-        os.replace(partial, path)
-        to_disk(path.parent)
-    except OSError as error:
-        raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
+        with writing(path):
+            make_folder(partial.parent)
+            _remove_leftovers(path)
+            _remove(partial)
+            yield partial
+            if partial.is_file():
+                to_disk(partial)
+            if path.is_dir() or partial.is_dir():
+                _remove(path)
+            os.replace(partial, path)
+            to_disk(path.parent)
     finally:
         with contextlib.suppress(OSError):
             _remove(partial)
@@ -293,13 +301,11 @@ def prepared_folder(
         LogWriteError: the folder cannot be created, or a file cannot be removed.
     """
     with contextlib.ExitStack() as stack:
-        try:
+        with writing(folder):
             make_folder(folder)
             stack.enter_context(locked_folder(folder))
             old = {*stale, *itertools.chain(*view_logs(folder, views).values())}
             old |= {folder / RECORDING} if stale else set()
             for path in sorted(old, reverse=True):  # last parts first: a kill leaves a beginning
                 path.unlink(missing_ok=True)
-        except OSError as error:
-            raise LogWriteError(f"{folder} cannot be written: {error.strerror}") from error
         yield

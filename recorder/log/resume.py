@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted import opened_regular
 from recorder.log.files import (
     RECORDING,
@@ -24,6 +24,7 @@ from recorder.log.files import (
     part_number,
     partial_path,
     view_logs,
+    writing,
 )
 from recorder.log.manifest import RecordingSpec, ViewMetadata, read_start
 from recorder.log.messages import RECORDING_METADATA, view_topic
@@ -308,7 +309,7 @@ def set_log_aside(place: ViewResume) -> Path | None:
         LogWriteError: a file cannot be removed or renamed.
     """
     path, aside = place.path, aside_path(place.path)
-    try:
+    with writing(path):
         for old in place.stale:
             old.unlink()
         if place.log is None:
@@ -317,8 +318,6 @@ def set_log_aside(place: ViewResume) -> Path | None:
             os.replace(place.log, aside)
         for shorter in (path, partial_path(path)):
             shorter.unlink(missing_ok=True)
-    except OSError as error:
-        raise LogWriteError(f"{path} cannot be resumed: {error.strerror}") from error
     return aside
 
 

@@ -211,9 +211,10 @@ class LogReader(LogStructure):
             LogDamagedError: without `skip_damaged`, at the first damage.
         """
         crc = at = 0
+        self.file.keep_reads()
         for segment in self.segments:
             yield segment, self.table(segment)
-            crc, at = self.file.crc(at, segment.stop, crc), segment.stop  # from the page cache
+            crc, at = self.file.crc(at, segment.stop, crc), segment.stop
         self._check_data(self.file.crc(at, self.data_end, crc))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted import open_regular
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.untrusted import file_number
 from recorder.mcap.records import crc32
 
 # Ending of the name of a file that is being written, or whose writing was interrupted.
@@ -46,13 +46,11 @@ class Store:
         Raises:
             UsageError: the file cannot be opened.
         """
-        try:
-            number = open_regular(path)
-            self._status = os.fstat(number)
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
+        number = file_number(path)
+        self._status = os.fstat(number)
         self.path, self.size = path, self._status.st_size
         self._window, self._window_at = b"", 0
+        self._reads: dict[int, bytes] | None = None
         # The finalizer also closes the file if nobody calls `close`.
         self._number, self._release = number, weakref.finalize(self, os.close, number)
 
@@ -79,7 +77,14 @@ class Store:
                 raise LogDamagedError(f"{self.path}: another program cut it while it was read")
             parts.append(part)
             offset, count = offset + len(part), count - len(part)
-        return parts[0] if len(parts) == 1 else b"".join(parts)
+        data = parts[0] if len(parts) == 1 else b"".join(parts)
+        if self._reads is not None and len(data) > _PEEK:
+            self._reads[offset - len(data)] = data
+        return data
+
+    def keep_reads(self) -> None:
+        """Keep the bytes read until the next call of `crc`, so that a pass reads each byte once."""
+        self._reads = {}
 
     def peek(self, offset: int, count: int) -> bytes:
         """Return at most `count` (few) bytes, and read ahead for further calls."""
@@ -98,8 +103,15 @@ class Store:
 
     def crc(self, offset: int, stop: int, value: int = 0) -> int:
         """Return the CRC-32 of the bytes [offset, stop) behind bytes with the CRC-32 `value`."""
+        reads, self._reads = self._reads, None
+        for start, data in sorted((reads or {}).items()):
+            if offset <= start and start + len(data) <= stop:
+                for block in self.blocks(offset, start):
+                    value = crc32(block, value)
+                value, offset = crc32(data, value), start + len(data)
         for block in self.blocks(offset, stop):
             value = crc32(block, value)
+        self._reads = None if reads is None else {}
         return value
 
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:

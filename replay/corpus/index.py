@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,36 +155,28 @@ def index_logs(
 
 def _summarize(indexed: Indexed, table: pa.Table) -> None:
     """Count what an index has: its logs, those with a problem, and how much of each kind."""
-    first = pc.equal(table["number"], 0)
-    broken = table.filter(pc.and_(first, pc.is_valid(table["problem"])))
+    broken = table.filter(pc.and_(pc.equal(table["number"], 0), pc.is_valid(table["problem"])))
     indexed.streams, indexed.files = table.num_rows, len(pc.unique(table["path"]))
     indexed.logs = len(pc.unique(table["log"]))
     indexed.unread = broken["state"].to_pylist().count("not read")
     indexed.broken = len(broken) - indexed.unread
     indexed.problems = broken.slice(0, MOST_PROBLEMS).select(["path", "problem"]).to_pylist()
-    streams = pa.table(
-        {
-            **{name: table[name] for name in ("log", "topic", "start_ns", "end_ns")},
-            "kind": pc.fill_null(pc.cast(table["kind"], pa.string()), "not read"),
-            "files": pc.cast(first, pa.int64()),
-            "bytes": pc.if_else(first, table["bytes"], 0),
-        }
-    )
-    logs = streams.group_by("log", use_threads=False).aggregate(
-        [("kind", "first"), ("files", "sum"), ("topic", "count"), ("bytes", "sum"),
-         ("start_ns", "min"), ("end_ns", "max")]
-    )  # fmt: skip
-    seconds = pc.divide(
-        pc.cast(pc.subtract(logs["end_ns_max"], logs["start_ns_min"]), pa.float64()), NANOSECONDS
-    )
-    logs = logs.append_column("seconds", pc.fill_null(seconds, 0.0))
-    sums = ("files_sum", "topic_count", "bytes_sum", "seconds")
-    kinds = logs.group_by("kind_first", use_threads=False).aggregate(
-        [("log", "count"), *((name, "sum") for name in sums)]
-    )
-    kinds = kinds.select(["kind_first", "log_count", *(f"{name}_sum" for name in sums)])
-    kinds = kinds.rename_columns(["kind", "logs", "files", "streams", "bytes", "seconds"])
-    indexed.kinds = kinds.sort_by("kind").to_pylist()
+    columns = ["log", "kind", "topic", "number", "bytes", "start_ns", "end_ns"]
+    logs: dict[str, list[dict[str, Any]]] = {}
+    for row in table.select(columns).to_pylist():
+        logs.setdefault(row["log"], []).append(row)
+    kinds: dict[str, Any] = {}
+    for rows in logs.values():
+        files = [row for row in rows if row["number"] == 0]
+        starts, ends = ([row[n] for row in rows if row[n] is not None] for n in columns[-2:])
+        kinds.setdefault(rows[0]["kind"] or "not read", Counter()).update(
+            logs=1,
+            files=len(files),
+            streams=sum(row["topic"] is not None for row in rows),
+            bytes=sum(row["bytes"] for row in files),
+            seconds=(max(ends) - min(starts)) / NANOSECONDS if starts and ends else 0.0,
+        )
+    indexed.kinds = [{"kind": kind, **kinds[kind]} for kind in sorted(kinds)]
 
 
 def indexed_logs(index: Path) -> list[IndexedLog]:
@@ -326,12 +319,10 @@ def _logs_by_path(words: Sequence[str | Path], index: Path) -> dict[str, ListedL
 
 def _known_states(table: pa.Table, deep: bool) -> dict[str, tuple[int, str]]:
     """Return size and time of change of the logs in an index; with `deep`, of decoded logs."""
-    decoded = pc.or_(table["deep"], not deep)
-    known = table.filter(pc.and_(pc.not_equal(table["changed"], ""), decoded))
+    rows = table.select(["path", "bytes", "changed", "deep", "state"]).to_pylist()
     # A log that was not read may be readable now, as when the missing package is installed.
-    known = known.filter(pc.not_equal(pc.fill_null(known["state"], ""), "not read"))
-    columns = (known[name].to_pylist() for name in ("path", "bytes", "changed"))
-    return {path: (size, changed) for path, size, changed in zip(*columns, strict=True)}
+    known = (row for row in rows if row["changed"] and row["state"] != "not read")
+    return {r["path"]: (r["bytes"], r["changed"]) for r in known if r["deep"] or not deep}
 
 
 def _write(tables: Sequence[pa.Table], index: Path) -> pa.Table:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from replay.integrity.listing import ListedLog, size_and_time
 from replay.integrity.report import failed
 from replay.logs.clock import missing
 from replay.logs.formats.lerobot import LAYOUT as DATASET
-from replay.logs.health import COLUMNS, Health, seconds
+from replay.logs.health import COLUMNS, Health, broken_rows
 from replay.logs.open_logs import identity_of, image_topics, is_external_format, open_stream
 from replay.logs.stream import ChannelInfo
 from replay.storage.identity import Identity, McapIdentity
@@ -176,21 +175,16 @@ def _decoded(place: Path, topic: str) -> dict[str, Any]:
     try:
         with open_stream(place, topic) as stream:
             shape = "x".join(map(str, stream.image(0).shape))
-            gaps = 0 if stream.times is None else int(missing(stream.times).sum())
-            if stream.program == DATASET:  # it pauses between episodes, where nothing is missing
-                gaps = 0
             health = Health()
-            for row, time in enumerate(seconds(stream).tolist()):
-                try:
-                    health.add(time, functools.partial(stream.image, row))
-                except MalformedRecord:
-                    gaps += stream.program == DATASET
-                except LogDamagedError:
-                    continue  # `verify` names every broken image
+            broken = list(broken_rows(stream, health))  # `verify` names every broken image
+            if stream.program == DATASET:  # it pauses between episodes, where nothing is missing
+                gaps = sum(isinstance(error, MalformedRecord) for _, error in broken)
+            else:
+                gaps = 0 if stream.times is None else int(missing(stream.times).sum())
             return {"shape": shape, "gaps": gaps, **health.columns()}
     except LogDamagedError as error:
         return {"problem": str(error).removeprefix(f"{place}: ")}
-    except (MalformedRecord, UsageError):  # the topic has no image
+    except UsageError:  # the topic has no image
         return {}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import zipfile
 from dataclasses import dataclass, field
@@ -112,9 +111,6 @@ class CameraMeter:
 
     def add(self, row: int, image: NDArray[Any]) -> None:
         """Measure the image of a row, (height, width) or (height, width, 3) uint8."""
-        # Images of PyAV are freed by the collector only, and few objects are made for each of them.
-        if len(self._rows) % 64 == 0:
-            gc.collect()
         factor = max(image.shape[1] // VIEW, 1)
         view = np.asarray(Image.fromarray(image).reduce(factor))
         gray = view if view.ndim == 2 else view.sum(2, dtype=np.int16) / np.float32(3)

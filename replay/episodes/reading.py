@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import hashlib
 import json
 import os
@@ -24,9 +25,8 @@ from replay.integrity.info import describe_log
 from replay.integrity.listing import ListedLog, find_logs
 from replay.logs.formats import lerobot
 from replay.logs.formats.messages import NoTopicError
-from replay.logs.health import RATE, seconds
 from replay.logs.open_logs import ALL, FORMATS, Format, log_format
-from replay.logs.stream import BROKEN, LogStream
+from replay.logs.stream import BROKEN, RATE, LogStream
 from replay.open_sources import is_recording, locations
 from replay.runs.folders import is_run
 from replay.storage.location import is_url, location
@@ -34,6 +34,10 @@ from replay.storage.paths import natural_order, no_such
 
 # Increased whenever a measure changes, so that stored ones are not used any more.
 VERSION: Final = 1
+
+# Images between two collections: PyAV's images are freed by the collector only, and each of them is
+# so few objects that it does not run by itself.
+COLLECT_EVERY: Final = 64
 
 # Formats of logs with topics.
 _WITH_TOPICS: Final = ("mcap", "split", "bag")
@@ -132,13 +136,13 @@ def _is_whole(folder: str) -> bool:
 
 def _of_dataset(log: EpisodeLog, prefix: str) -> Iterator[EpisodeLog]:
     """Yield the episodes of a LeRobot dataset."""
-    first = 0
-    rows, missing = lerobot.episode_facts(location(log.files[0]))
-    left = f"{log.files[0]}: {missing}" if missing else ""
-    for row in rows:
+    first, dataset = 0, lerobot.Dataset(location(log.files[0]))
+    left = f"{log.files[0]}: {dataset.missing}" if dataset.missing else ""
+    for row in dataset.rows:
         length, number = int(row.pop("length")), int(row.pop("episode_index"))
         row["task"] = "; ".join(map(str, row.pop("tasks", None) or []))
         about = {k: str(v) for k, v in row.items() if isinstance(v, str | int) and v != ""}
+        about = {k: v for k, v in about.items() if "/" not in k and not k.startswith("dataset_")}
         name, place = f"{prefix}episode {number}", (number, first, length)
         yield EpisodeLog(name, log.files, log.state, about, *place, topics=log.topics, missing=left)
         first += length
@@ -156,11 +160,11 @@ def open_cameras(log: EpisodeLog, opened: ExitStack) -> dict[str, LogStream]:
         if format != "dataset" or lerobot.features(path)[1]:
             topics = ALL if format in (*_WITH_TOPICS, "dataset") else ()
             with suppress(NoTopicError):
-                streams += FORMATS[format](path, InputOptions(topics=topics, color=True), opened)
+                streams += _streams(log, path, format, opened, topics=topics, color=True)
     # A file without topics is named by itself, but its camera is the same in all episodes.
     alone = format in ("video", "images")
     names = ("camera",) if alone else stream_names([stream.topic for stream in streams])
-    return dict(zip(names, (_of_episode(log, stream) for stream in streams), strict=True))
+    return dict(zip(names, streams, strict=True))
 
 
 def read_numbers(log: EpisodeLog, opened: ExitStack) -> dict[str, Rows]:
@@ -190,13 +194,13 @@ def read_numbers(log: EpisodeLog, opened: ExitStack) -> dict[str, Rows]:
 
 def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: ExitStack) -> Rows:
     topic, _, field = word.partition(":")
-    options = InputOptions(topics=(topic,), fields=(field or "position",))
     if format == "dataset":
-        options = InputOptions(fields=(word,))
-    (whole,) = FORMATS[format](path, options, opened)
-    stream = _of_episode(log, whole)
+        (stream,) = _streams(log, path, format, opened, fields=(word,))
+    else:
+        fields = (field or "position",)
+        (stream,) = _streams(log, path, format, opened, topics=(topic,), fields=fields)
     if stream.read is not None:
-        return seconds(stream), np.asarray(stream.read(range(stream.count))[0], np.float64)
+        return stream.seconds(), np.asarray(stream.read(range(stream.count))[0], np.float64)
     rows, values = list[int](), list[Any]()
     for row in range(stream.count):
         with suppress(*BROKEN):
@@ -207,14 +211,28 @@ def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: Exi
             f"{path}: {topic} has a changing number of values: choose a part of "
             f"them, as in --state {topic}:position[0:6]"
         )
-    return seconds(stream)[rows], np.stack(values)
+    return stream.seconds()[rows], np.stack(values)
 
 
-def _of_episode(log: EpisodeLog, stream: LogStream) -> LogStream:
-    if log.number < 0 or stream.times is None:
-        return stream
+def _streams(
+    log: EpisodeLog, path: Path, format: Format, opened: ExitStack, **options: Any
+) -> list[LogStream]:
+    """Open streams of a file of an episode; of a dataset, the rows of the episode."""
+    chosen = InputOptions(**options)
+    if format != "dataset":
+        return FORMATS[format](path, chosen, opened)
+    streams = _of_dataset_once(path, log.state, chosen)
     rows = np.arange(log.first, log.first + log.count)
-    return stream.part(rows, stream.times[rows])
+    return [stream.part(rows, stream.times[rows]) for stream in streams if stream.times is not None]
+
+
+@functools.lru_cache(maxsize=8)
+def _of_dataset_once(path: Path, state: tuple[int, str], options: InputOptions) -> list[LogStream]:
+    """Open streams of a LeRobot dataset once for all of its episodes, until the process ends.
+
+    Its tables and the numbers in them belong to all episodes.
+    """
+    return FORMATS["dataset"](path, options, ExitStack())
 
 
 def measure_episode(log: EpisodeLog) -> Measured:
@@ -242,7 +260,7 @@ def _measure(
             measured.remarks.append(f"{left}: they are left out")
         if whole.any():
             measured.numbers[kind] = times[whole], values[whole]
-    clocks = {name: seconds(stream) for name, stream in cameras.items()}
+    clocks = {name: stream.seconds() for name, stream in cameras.items()}
     every = [*clocks.values(), *(times for times, _ in measured.numbers.values())]
     if not every:
         raise UsageError(f"{measured.name}: no images and no joint states were found")
@@ -252,7 +270,9 @@ def _measure(
     measured.numbers = {kind: (t - zero, values) for kind, (t, values) in measured.numbers.items()}
     meters = {name: CameraMeter(times - zero) for name, times in clocks.items()}
     rows = [(time, name, row) for name, t in clocks.items() for row, time in enumerate(t.tolist())]
-    for time, name, row in sorted(rows, key=lambda one: one[0]):
+    for place, (time, name, row) in enumerate(sorted(rows, key=lambda one: one[0])):
+        if place % COLLECT_EVERY == 0:
+            gc.collect()
         try:
             meters[name].add(row, cameras[name].image(row))
         except BROKEN as error:

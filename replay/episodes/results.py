@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +16,7 @@ from cdmisfa.core.names import counted
 from recorder.log.files import atomic_write
 from replay.episodes.ranking import Ranked, column_name
 from replay.episodes.reading import open_cameras
-from replay.logs.health import seconds
+from replay.report.figures import data_uri
 from replay.report.page import rendered
 from replay.report.svg_plot import WIDE, Axis, Plot
 
@@ -77,7 +75,7 @@ def _entry(ranked: Ranked, episode: int) -> dict[str, Any]:
         if not (cameras := open_cameras(log, opened)):
             raise UsageError("the episode has no images")
         camera = cameras.get(column.camera if column else "", next(iter(cameras.values())))
-        times = seconds(camera) - seconds(camera)[0]
+        times = camera.seconds() - camera.seconds()[0]
         rows = {int(row) for row in np.linspace(0, len(times) - 1, IMAGES + 2)[1:-1]}
         moment = -1
         if column is not None and np.isfinite(column.at[episode]):
@@ -86,9 +84,7 @@ def _entry(ranked: Ranked, episode: int) -> dict[str, Any]:
         for row in sorted(rows):
             image = Image.fromarray(camera.image(row)).convert("RGB")
             image.thumbnail((WIDTH, WIDTH))
-            data = io.BytesIO()
-            image.save(data, "JPEG", quality=75)
-            source = f"data:image/jpeg;base64,{base64.b64encode(data.getvalue()).decode()}"
+            source = data_uri(np.asarray(image), photo=True)
             images.append((f"{times[row]:.1f} s", source, row == moment))
     words = [words for words, _ in reasons]
     about = ", ".join(log.about.values())

@@ -25,8 +25,7 @@ from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
 from recorder.images.options import IMAGES, InputOptions
 from replay.export.frames import image_shape, pieces, pixel_format, shared_spans, write_video
 from replay.export.numbers import ACTIONS, READ, STATE, Columns, Message, log_columns
-from replay.export.statistics import ImageStats, number_stats
-from replay.logs.formats.lerobot_layout import Stats, table_of_tasks, write_stats
+from replay.logs.formats import lerobot_layout as layout
 from replay.logs.open_logs import log_format
 from replay.logs.source import LoggedSource
 from replay.stored_source import Span
@@ -103,7 +102,7 @@ def write_dataset(
                     key = f"observation.images.{view}"
                     features[key] = _video_feature(source, stream, fps, lossless=options.lossless)
                     file = _path(folder / "videos" / key, log, "mp4")
-                    stats = [ImageStats() for _ in spans]
+                    stats = [layout.ImageStats() for _ in spans]
                     write_video(
                         source, stream, file, lossless=options.lossless, spans=spans, stats=stats
                     )
@@ -137,7 +136,7 @@ def _rows(
             **_file_number("data", 0),
             "dataset_from_index": start + begin,
             "dataset_to_index": start + end,
-            "stats": {k: number_stats(v[begin:end]) for k, (v, _) in columns.items()},
+            "stats": {k: layout.number_stats(v[begin:end]) for k, (v, _) in columns.items()},
         }
         for i, (begin, end) in enumerate(itertools.pairwise(ends))
     ]
@@ -292,13 +291,13 @@ def _write_meta(
     fps: int,
 ) -> None:
     """Write the files that describe a dataset: episodes, tasks, info and statistics."""
-    stats: list[dict[str, Stats]] = [row.pop("stats") for row in episodes]
+    stats: list[dict[str, layout.Stats]] = [row.pop("stats") for row in episodes]
     for row, of_episode in zip(episodes, stats, strict=True):
         for key, values in of_episode.items():
             row |= {f"stats/{key}/{name}": value.tolist() for name, value in values.items()}
         row |= _file_number("meta/episodes", 0)
     pq.write_table(pa.Table.from_pylist(episodes), _path(meta / "episodes", 0, "parquet"))
-    pq.write_table(table_of_tasks(tasks), meta / "tasks.parquet")
+    pq.write_table(layout.table_of_tasks(tasks), meta / "tasks.parquet")
     videos = any(feature["dtype"] == "video" for feature in features.values())
     info = {
         "codebase_version": "v3.0",
@@ -316,4 +315,6 @@ def _write_meta(
         "features": features,
     }
     (meta / "info.json").write_text(json.dumps(info, indent=4), "utf-8")
-    write_stats(meta / "stats.json", {key: [part[key] for part in stats] for key in features})
+    layout.write_stats(
+        meta / "stats.json", {key: [part[key] for part in stats] for key in features}
+    )

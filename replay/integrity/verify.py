@@ -26,7 +26,7 @@ from replay.integrity.report import LogReport, State, as_problem, combined, fail
 from replay.logs.formats import views as recorded
 from replay.logs.formats.mcap_log import decoders_in
 from replay.logs.formats.recording import ViewFile
-from replay.logs.health import Health, seconds
+from replay.logs.health import Health, broken_rows
 from replay.logs.open_logs import (
     channels_of,
     image_topics,
@@ -345,17 +345,14 @@ def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ())
         try:
             with open_stream(path, topic) as stream:
                 measured = health.setdefault(topic, Health())
-                for row, time in enumerate(seconds(stream).tolist()):
-                    try:
-                        measured.add(time, functools.partial(stream.image, row))
-                    except LogDamagedError as error:
-                        problems.append(Problem(stream.name_of(row), str(error)))
+                for row, error in broken_rows(stream, measured):
+                    problems.append(Problem(stream.name_of(row), str(error)))
                 missing |= dict.fromkeys([stream.missing] if stream.missing else [])
                 notes |= dict.fromkeys((*stream.remarks, *stream.warnings))
-        except LogDamagedError as error:
-            problems.append(as_problem(path, error))
-        except UsageError as error:  # it needs an option
-            reason = str(error).removeprefix(f"{path}: ")
+        except LogDamagedError as damage:
+            problems.append(as_problem(path, damage))
+        except UsageError as refusal:  # it needs an option
+            reason = str(refusal).removeprefix(f"{path}: ")
             notes[f"{path}: {topic} was not decoded: {reason}"] = None
     state: State = "damaged" if problems else "cut short" if missing else "whole"
     problems += [Problem(str(path), what) for what in missing]

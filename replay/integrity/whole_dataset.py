@@ -28,7 +28,7 @@ def write_whole(src: Path, dst: Path) -> tuple[lerobot.Dataset, bool]:
         LogDamagedError: no episode is whole, or a table is damaged.
         LogWriteError: the folder cannot be written.
     """
-    dataset = lerobot.Dataset(src, ["tasks", "dataset_from_index"])
+    dataset = lerobot.Dataset(src)
     info, rows = dataset.info, dataset.rows
     numbers = {int(row["episode_index"]) for row in rows}
     frames = layout.table_frames(info, rows)

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
+from cdmisfa.core.errors import LogDamagedError
 from recorder.images.pixels import HIGH_BYTE, Content, losses
 from replay.logs.stream import LogStream
 
 # Brightness below which a pixel is black, and above which it is saturated.
 BLACK: Final = 16
 WHITE: Final = 250
-
-# Images per second of a stream that states no times.
-RATE: Final = 30.0
 
 # Largest width of the grid of pixels that is compared. Pixels are not averaged: the sensor noise,
 # which tells a frozen image from a scene at rest, would vanish.
@@ -112,7 +111,7 @@ class Health:
         return dict(zip(COLUMNS, rounded, strict=True))
 
     def remark(self) -> str:
-        """Return what is remarkable about the images, or ""."""
+        """Return a line about frozen, repeated, black and saturated images, or ""."""
         columns, parts = self.columns(), list[str]()
         if (at := columns.get("frozen_at")) is not None:
             parts.append(f"frozen for {columns['frozen_seconds']:.1f} s at {at:.1f} s")
@@ -121,6 +120,15 @@ class Health:
             if share >= 0.01 or share * len(self._times) >= _LEAST:
                 parts.append(f"{100 * share:.1f} % of the images are {name}")
         return "; ".join(parts)
+
+
+def broken_rows(stream: LogStream, health: Health) -> Iterator[tuple[int, LogDamagedError]]:
+    """Measure all images of a stream, and yield each row that is broken, with its error."""
+    for row, time in enumerate(stream.seconds().tolist()):
+        try:
+            health.add(time, partial(stream.image, row))
+        except LogDamagedError as error:
+            yield row, error
 
 
 def _shows_noise(
@@ -144,10 +152,3 @@ def _jumps(far: FloatArray, same: NDArray[np.bool_], first: int, stop: int) -> b
     moves = np.concatenate([far[part][~same[part]] for part in near])
     after = far[stop : stop + 3].max(initial=0)  # a codec may show the motion two images later
     return bool(len(moves) >= _LEAST and after > 2.5 * np.quantile(moves, 0.75) + 0.01)
-
-
-def seconds(stream: LogStream) -> FloatArray:
-    """Return the time of each row of a stream (s)."""
-    if stream.times is None:
-        return np.arange(stream.count) / RATE
-    return np.asarray(stream.times / 1e9, np.float64)

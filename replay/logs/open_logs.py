@@ -78,76 +78,66 @@ def image_logs(paths: Sequence[str | Path]) -> list[Path]:
     return logs
 
 
-class OpenLogs:
-    """The streams of several logs, while they are opened.
+def open_streams(
+    files: Sequence[Path], options: InputOptions, opened: ExitStack, *, skip_damaged: bool = False
+) -> tuple[list[LogStream], list[tuple[Path, LogReader | None]], list[str]]:
+    """Open the topics of several logs that are asked for.
 
-    Attributes:
-        streams: the streams, in the order of their topics, and of the logs.
-        logs: the logs that were opened, MCAP files with their readers.
-        left_out: a line for each log that could not be read.
+    Without topics each log has one stream. As many topics as logs are one of each log in turn;
+    otherwise a topic, or every one that a pattern fits, is looked for in every log.
+
+    Args:
+        files: the logs.
+        options: the topics, and whether images or fields are read.
+        opened: closes the logs.
+        skip_damaged: skip damaged parts, and of several logs those that cannot be read.
+
+    Returns:
+        The streams, in the order of their topics, and of the logs; the logs that were opened, MCAP
+        files with their readers; and a line for each log that could not be read.
+
+    Raises:
+        UsageError: no log has a topic.
+        LogDamagedError: a log is damaged; with `skip_damaged` all are.
     """
+    topics, result = options.topics, list[LogStream]()
+    logs: list[tuple[Path, LogReader | None]] = []
+    patterns = any(letter in topic for topic in topics for letter in "*?[")
+    in_turn = len(topics) == len(files) > 1 and not patterns
+    broken: list[LogDamagedError] = []
+    refused: list[NoTopicError] = []
+    for i, file in enumerate(files):
+        chosen = replace(options, topics=topics[i : i + 1]) if in_turn else options
+        try:
+            streams = FORMATS[log_format(file)](file, chosen, opened, skip_damaged=skip_damaged)
+            result += streams
+            logs.append((file, streams[0].reader))
+        except NoTopicError as error:
+            if in_turn or len(files) == 1 or not topics:
+                raise
+            refused.append(error)
+        except LogDamagedError as error:
+            if not skip_damaged or len(files) == 1:
+                raise
+            broken.append(error)
+    if not result:
+        raise [*refused, *broken][0]
+    if topics and not in_turn:
+        for topic in topics:
+            if not any(fits_topic(stream.topic, [topic]) for stream in result):
+                alone = replace(options, topics=(topic,))  # whose error names those there are
+                FORMATS[log_format(files[0])](files[0], alone, opened)
 
-    def __init__(
-        self,
-        files: Sequence[Path],
-        options: InputOptions,
-        opened: ExitStack,
-        *,
-        skip_damaged: bool = False,
-    ) -> None:
-        """Open the topics that are asked for.
+        def place(stream: LogStream) -> int:
+            return [*(fits_topic(stream.topic, [t]) for t in topics), True].index(True)
 
-        Without topics each log has one stream. As many topics as logs are one of each log in turn;
-        otherwise a topic, or every one that a pattern fits, is looked for in every log.
-
-        Args:
-            files: the logs.
-            options: the topics, and whether images or fields are read.
-            opened: closes the logs.
-            skip_damaged: skip damaged parts, and of several logs those that cannot be read.
-
-        Raises:
-            UsageError: no log has a topic.
-            LogDamagedError: a log is damaged; with `skip_damaged` all are.
-        """
-        topics, self.streams = options.topics, list[LogStream]()
-        self.logs: list[tuple[Path, LogReader | None]] = []
-        patterns = any(letter in topic for topic in topics for letter in "*?[")
-        in_turn = len(topics) == len(files) > 1 and not patterns
-        broken: list[LogDamagedError] = []
-        refused: list[NoTopicError] = []
-        for i, file in enumerate(files):
-            chosen = replace(options, topics=topics[i : i + 1]) if in_turn else options
-            try:
-                streams = FORMATS[log_format(file)](file, chosen, opened, skip_damaged=skip_damaged)
-                self.streams += streams
-                self.logs.append((file, streams[0].reader))
-            except NoTopicError as error:
-                if in_turn or len(files) == 1 or not topics:
-                    raise
-                refused.append(error)
-            except LogDamagedError as error:
-                if not skip_damaged or len(files) == 1:
-                    raise
-                broken.append(error)
-        self.left_out = [f"{error}: this log is skipped" for error in broken]
-        if not self.streams:
-            raise [*refused, *broken][0]
-        if topics and not in_turn:
-            for topic in topics:
-                if not any(fits_topic(stream.topic, [topic]) for stream in self.streams):
-                    alone = replace(options, topics=(topic,))  # whose error names those there are
-                    FORMATS[log_format(files[0])](files[0], alone, opened)
-
-            def place(stream: LogStream) -> int:
-                return [*(fits_topic(stream.topic, [t]) for t in topics), True].index(True)
-
-            self.streams.sort(key=place)
+        result.sort(key=place)
+    return result, logs, [f"{error}: this log is skipped" for error in broken]
 
 
 @contextlib.contextmanager
 def open_stream(path: Path, topic: str | None = None) -> Iterator[LogStream]:
-    """Open one stream of a log; raises as `OpenLogs`."""
+    """Open one stream of a log; raises as `open_streams`."""
     options = InputOptions() if topic is None else InputOptions(topics=(topic,))
     with ExitStack() as opened:
         yield FORMATS[log_format(path)](path, options, opened)[0]

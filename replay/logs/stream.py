@@ -22,6 +22,9 @@ from recorder.mcap.records import MalformedRecord
 # Log times from here on count as damage, in nanoseconds: the year 2116.
 LAST_NS: Final = 2**62
 
+# Images per second of a stream that states no times.
+RATE: Final = 30.0
+
 Value = TypeVar("Value")
 
 # Numbers of rows of a stream, from 0. A row is one message, image or row of a table.
@@ -130,6 +133,12 @@ class LogStream:
         """Apply a function to the stored bytes of a row; raises as `image`."""
         with limited(self.path, self.program, memory_bytes=self.memory_bytes()):
             return function(self.fetch(row))
+
+    def seconds(self) -> FloatArray:
+        """Return the time of each row (s)."""
+        if self.times is None:
+            return np.arange(self.count) / RATE
+        return np.asarray(self.times / 1e9, np.float64)
 
     def name_of(self, row: int) -> str:
         """Return how an error names a row."""

@@ -249,11 +249,11 @@ def numbers(row: NDArray[Any]) -> str:
     return ", ".join(f"{v:.3g}" for v in values[:NUMBERS]) + " …" * (len(values) > NUMBERS)
 
 
-def data_uri(image: NDArray[np.uint8]) -> str:
-    """Return an image as a data URI: a JPEG of (height, width), a PNG of (height, width, 3)."""
+def data_uri(image: NDArray[np.uint8], *, photo: bool | None = None) -> str:
+    """Return an image as a data URI: a photo as JPEG, by default a gray one; others as PNG."""
     from PIL import Image
 
-    data, photo = io.BytesIO(), image.ndim == 2
+    data, photo = io.BytesIO(), image.ndim == 2 if photo is None else photo
     how: dict[str, Any] = {"quality": 78} if photo else {"optimize": True}
     Image.fromarray(np.ascontiguousarray(image)).save(data, "JPEG" if photo else "PNG", **how)
     encoded = base64.b64encode(data.getvalue()).decode()

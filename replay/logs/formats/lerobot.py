@@ -54,9 +54,9 @@ class Dataset:
         times: time of each frame in nanoseconds.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+    def __init__(self, path: Path) -> None:
         self.path, self.info = path, _info(path)
-        self.rows, self.missing = _episodes(path, ["episode_index", "length", *columns])
+        self.rows, self.missing = _episodes(path, self.info)
         with limited(path, LAYOUT):
             lengths = np.array([int(row["length"]) for row in self.rows], np.int64)
             self.starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -95,50 +95,52 @@ def streams(
     if not (chosen or numbers) or (not topics and len(chosen) > 1):
         wrong = f"no topic {', '.join(topics)}" if topics else "choose a --topic"
         raise NoTopicError(f"{path}: {wrong}; it has images on: {', '.join(cameras) or 'none'}")
-    opened_streams = [_numbers(path, topic, names, options) for topic, names in numbers.items()]
+    if absent := [n for names in numbers.values() for n in names if n not in numeric]:
+        raise UsageError(f"{path}: no field {absent[0]}; choose from {', '.join(numeric)}")
+    dataset = Dataset(path)
+    opened_streams = [_numbers(dataset, topic, names, options) for topic, names in numbers.items()]
     for topic in chosen:
-        camera = _Camera(path, topic, color=options.color is True)
+        camera = _Camera(dataset, topic, color=options.color is True)
         opened.callback(camera.close)
         stream = LogStream(
             path=path,
             topic=topic,
-            count=len(camera.dataset.times),
-            times=camera.dataset.times,
+            count=len(dataset.times),
+            times=dataset.times,
             fetch=camera.fetch,
             decode=camera.decode,
             compressed=None if camera.video else bytes,
             memory_bytes=camera.memory_bytes,
             program=LAYOUT,
             recipe=VIDEO_RECIPE if camera.video else RECIPE,
-            warnings=camera.dataset.notes(topic),
-            missing=camera.dataset.missing,
+            warnings=dataset.notes(topic),
+            missing=dataset.missing,
         )
         opened_streams.append(stream)
     read = [(feature,) for feature in (*chosen, *fields, *topics, *CLOCK)]
-    notes = left_out(path, _info(path)["features"], read, options)
+    notes = left_out(path, dataset.info["features"], read, options)
     return [replace(stream, notes=notes) for stream in opened_streams]
 
 
 class _Camera:
     """The images of one camera, in videos or in tables."""
 
-    def __init__(self, path: Path, topic: str, *, color: bool) -> None:
-        self._topic, self._color = topic, color
-        self.video = _info(path)["features"][topic]["dtype"] == "video"
-        start = f"videos/{topic}/from_timestamp" if self.video else "dataset_from_index"
-        self.dataset = Dataset(path, [start])
-        self._fps = float(self.dataset.info["fps"])
-        scale = self._fps if self.video else 1
-        with explained(path, LAYOUT):
-            rows, key = self.dataset.rows, topic if self.video else ""
-            self._files = [layout.episode_file(self.dataset.info, row, key) for row in rows]
-            self._first = [round(float(row[start]) * scale) for row in rows]
+    def __init__(self, dataset: Dataset, topic: str, *, color: bool) -> None:
+        self._dataset, self._topic, self._color = dataset, topic, color
+        self._fps = float(dataset.info["fps"])
+        self.video = topic in layout.video_cameras(dataset.info)
+        key, start, scale = "", "dataset_from_index", 1.0
+        if self.video:
+            key, start, scale = topic, f"videos/{topic}/from_timestamp", self._fps
+        with explained(dataset.path, LAYOUT):
+            self._files = [layout.episode_file(dataset.info, row, key) for row in dataset.rows]
+            self._first = [round(float(row[start]) * scale) for row in dataset.rows]
         self._file: Path | None = None
         self._images: Any = None
 
     def fetch(self, row: int) -> Any:
         """Read the JPEG or PNG of a frame, or find its place in a video; the file stays open."""
-        dataset = self.dataset
+        dataset = self._dataset
         episode = int(np.searchsorted(dataset.starts, row, side="right")) - 1
         place = self._first[episode] + row - int(dataset.starts[episode])
         name = self._files[episode]
@@ -192,13 +194,11 @@ class _Camera:
         return data
 
 
-def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptions) -> LogStream:
+def _numbers(
+    dataset: Dataset, topic: str, names: tuple[str, ...], options: InputOptions
+) -> LogStream:
     """Return fields of a dataset, as observation.state and action, one row of numbers a frame."""
-    what = ", ".join(names)
-    known = features(path)[0]
-    if absent := [name for name in names if name not in known]:
-        raise UsageError(f"{path}: no field {absent[0]}; choose from {', '.join(known)}")
-    dataset = Dataset(path, ["dataset_from_index"])
+    path, what = dataset.path, ", ".join(names)
     frames = frame_numbers(dataset, names)
     stream = number_stream(
         path, topic, {what: frames}, dataset.times, options, lambda row: f"{path}: frame {row}"
@@ -213,7 +213,7 @@ def _numbers(path: Path, topic: str, names: tuple[str, ...], options: InputOptio
 
 
 def frame_numbers(dataset: Dataset, names: Sequence[str]) -> FloatArray:
-    """Return numbers of each frame of a dataset that has `dataset_from_index`, (frames, n)."""
+    """Return numbers of each frame of a dataset, (frames, n)."""
     path = dataset.path
     files = sorted({path / layout.episode_file(dataset.info, row) for row in dataset.rows})
     if absent := [str(file) for file in files if not file.is_file()]:
@@ -232,7 +232,7 @@ def is_dataset(path: Path) -> bool:
 
 def dataset_channels(path: Path) -> list[ExternalChannel]:
     """Return the features of a dataset, one value a frame."""
-    dataset, channels = Dataset(path, ()), []
+    dataset, channels = Dataset(path), []
     info, count = dataset.info, len(dataset.times)
     last = round(max(count - 1, 0) * NANOSECONDS / float(info["fps"]))
     for name, feature in info["features"].items():
@@ -282,23 +282,11 @@ def _info(path: Path) -> Any:
         return info
 
 
-def episode_facts(path: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return the facts about each whole episode besides its files, and a message about the rest."""
-    rows, missing = _episodes(path, ())
-    names = dict.fromkeys(name for row in rows for name in row)
-    facts = [n for n in names if "/" not in n and not n.startswith("dataset_")]
-    return [{name: row.get(name) for name in facts} for row in rows], missing
-
-
-def _episodes(path: Path, columns: Sequence[str]) -> tuple[list[dict[str, Any]], str]:
-    """Return the rows of the tables of episodes, in their order, and a message about the rest.
-
-    Without `columns` they have every fact about the episodes.
-    """
+def _episodes(path: Path, info: Any) -> tuple[list[dict[str, Any]], str]:
+    """Return what the tables state about episodes, in their order, and a message about the rest."""
     import pyarrow.parquet as pq
 
-    info, damage = _info(path), list[str]()
-    rows: list[dict[str, Any]] = []
+    damage, rows = list[str](), list[dict[str, Any]]()
     if (path / V21).is_file():
         rows = _v21_episodes(path, info, damage)
     elif not (files := tables(path, "meta/episodes")):
@@ -310,8 +298,7 @@ def _episodes(path: Path, columns: Sequence[str]) -> tuple[list[dict[str, Any]],
                 break
             with limited(file, "PyArrow"):
                 parquet = pq.ParquetFile(file)
-                names = columns or [n for n in parquet.schema_arrow.names if "/" not in n]
-                names = list(dict.fromkeys([*names, *layout.place_columns(info)]))
+                names = [n for n in parquet.schema_arrow.names if not n.startswith("stats/")]
                 rows += parquet.read(columns=names, use_threads=False).to_pylist()
     with explained(path, LAYOUT):
         rows.sort(key=lambda row: int(row["episode_index"]))
