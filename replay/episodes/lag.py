@@ -114,12 +114,12 @@ def lag_column(
     apart = away > [max(1.5 * frame, CERTAIN_AWAY * lag.error) for lag in lags]
     apart &= [lag.clear for lag in lags]
     gain = [lag.curve.max() - lag.curve[round(typical / frame) + span] for lag in lags]
-    # A clear peak that is uncertain by itself confirms the lag of all if it is within a frame of it.
-    for i, lag in enumerate(lags):
+    # A clear peak that is uncertain by itself confirms the lag of all within a frame of it.
+    for place, lag in enumerate(lags):
         distance = abs(lag.seconds - whole.seconds)
-        if whole.certain and lag.clear and not (lag.certain or apart[i]) and distance <= frame:
+        if whole.certain and lag.clear and not (lag.certain or apart[place]) and distance <= frame:
             error = max(whole.error, distance)
-            lags[i] = lag._replace(seconds=whole.seconds, error=error, certain=True)
+            lags[place] = lag._replace(seconds=whole.seconds, error=error, certain=True)
     certain = apart | [lag.certain for lag in lags]
     seconds = [lag.seconds for lag in lags]
     return column("lag", apart * gain, np.where(certain, seconds, np.nan)), lags, whole
