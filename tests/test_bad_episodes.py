@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,8 @@ from replay.episodes.images import shift
 from replay.episodes.lag import Lag, lag_column
 from replay.episodes.measure import CameraMeter, Measured
 from replay.episodes.numbers import column, longest
-from replay.episodes.ranking import rank_episodes
+from replay.episodes.ranking import Ranked, compare, rank_episodes
+from replay.episodes.reading import EpisodeLog
 from replay.episodes.reasons import REASONS, scores
 
 FPS, COUNT, KEY = 20, 120, "observation.images.cam"
@@ -253,3 +256,43 @@ def test_a_reason_that_many_share_is_none_if_they_are_alike() -> None:
     frozen, _ = scores(column("frozen", x), groups)  # a fault, however many have it
     assert np.flatnonzero(frozen >= 1).tolist() == [*range(8), 39]
     assert not REASONS["frozen"].relative
+
+
+def compared(episodes: Sequence[Measured]) -> Ranked:
+    logs = [EpisodeLog(f"{i}.mcap", (f"{i}.mcap",), (0, ""), {}) for i in range(len(episodes))]
+    return compare(logs, [*episodes])
+
+
+def part(episode: Measured, keep: np.ndarray) -> Measured:
+    """Return an episode with some of its images."""
+    cameras = {
+        name: replace(
+            camera,
+            times=camera.times[keep],
+            frames=camera.frames[keep],
+            thumbnails=camera.thumbnails[keep],
+        )
+        for name, camera in episode.cameras.items()
+    }
+    return Measured(episode.name, cameras, episode.numbers)
+
+
+def test_lost_images_and_a_late_camera_are_reasons_beside_the_lag_of_the_others() -> None:
+    episodes = [log(7 if seed == 4 else 1, seed) for seed in range(10)]
+    lost = np.random.default_rng(0).random(1200) < 0.75
+    ranked = compared([part(one, lost) if i == 2 else one for i, one in enumerate(episodes)])
+    assert {2, 4} <= {*ranked.flagged}
+    assert any("of images are missing" in words for words, _ in ranked.reasons(2))
+    (late,) = (words for words, _ in ranked.reasons(4) if "behind the joints" in words)
+    assert re.search(r"camera \+0\.3\d s behind the joints, the others \+0\.0[4-7] s", late)
+    lags = np.array([ranked.lags[i, "cam"].seconds for i in range(10)])
+    assert np.all(np.abs(np.delete(lags, 4) - 1 / FPS) <= 1 / FPS)
+
+
+def test_few_episodes_and_other_joints_are_compared_with_a_note() -> None:
+    other = log(0, 1)
+    times, joints = other.numbers["state"]
+    other.numbers["state"] = times, joints[:, :1]
+    ranked = compared([log(0, 0), other])
+    assert not ranked.flagged
+    assert any("it needs 10 or more" in note for note in ranked.notes)

@@ -12,7 +12,7 @@ from sources import ROOT, files, name, tree
 
 PAGES = ("docs/project/contributing.md", "docs/how-to/find-bad-episodes.md")
 EQUATIONS = [str(number) for number in range(1, 10)]
-EQUATIONS += [f"P{number}" for number in range(1, 5)] + [f"E{number}" for number in range(1, 20)]
+EQUATIONS += [f"P{number}" for number in range(1, 5)] + [f"E{number}" for number in range(1, 21)]
 """The paper's equations, the progress learner's, and those of reasons of bad episodes."""
 
 LINE = re.compile(r"^\s*Equation:(.*)$", re.MULTILINE)

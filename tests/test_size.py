@@ -30,7 +30,7 @@ CEILINGS = {
     "recorder/world": 1410,
     "replay": 740,
     "replay/corpus": 740,
-    "replay/episodes": 1185,
+    "replay/episodes": 1230,
     "replay/export": 982,
     "replay/integrity": 1117,
     "replay/logs": 3040,

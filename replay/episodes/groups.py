@@ -16,7 +16,7 @@ from replay.episodes.reading import EpisodeLog
 
 # Smallest group, as a share of all episodes and in episodes.
 SHARE: Final = 0.1
-SMALLEST: Final = 4
+SMALLEST: Final = 6
 
 # Difference of two pixels, in standard deviations of a view, beyond which it counts no more: things
 # on the table move between episodes, and a camera that is moved changes all edges a little.

@@ -19,6 +19,9 @@ SAME: Final = 0.1
 AROUND: Final = 5
 SEEN: Final = 0.8
 
+# Time between two images from which on some are missing, in their median time.
+PAUSE: Final = 1.5
+
 # Share of black pixels from which on nothing else is told of an image.
 DARK: Final = 0.8
 
@@ -36,7 +39,25 @@ def columns_of_images(episodes: Sequence[Measured], camera: str) -> list[Column]
         clocks = zip(cameras, moving, path, strict=True)
         reached = [np.interp(c.times, times, along) / speed for c, (times, _), along in clocks]
         steps = [np.diff(part, prepend=part[:1]) for part in reached]
-    return [*_exposure(cameras), *_views(cameras), *_frozen(cameras, steps)]
+    return [
+        *_exposure(cameras), *_views(cameras), *_frozen(cameras, steps), _dropped(cameras)
+    ]  # fmt: skip
+
+
+def _dropped(cameras: Sequence[CameraMeasures]) -> Column:
+    """Return the time without images, beyond the usual one between two of them.
+
+    dropped = sum of d - p over times d between images above 1.5 p, p their median
+
+    Equation: E20
+    """
+    steps = [np.diff(camera.times, prepend=camera.times[:1]) for camera in cameras]
+    pauses = [
+        np.where(step > PAUSE * period(camera.times), step - period(camera.times), 0)
+        for step, camera in zip(steps, cameras, strict=True)
+    ]
+    rows = [max(int(part.argmax()) - 1, 0) for part in pauses]
+    return column("dropped", [part.sum() for part in pauses], at=_times(cameras, rows))
 
 
 def _frozen(cameras: Sequence[CameraMeasures], steps: Sequence[FloatArray] | None) -> list[Column]:

@@ -55,10 +55,12 @@ def column(reason: str, compared: Any, value: Any = None, at: Any = None) -> Col
 
 
 def scaled(episodes: Sequence[Measured], kind: str) -> Numbers | None:
-    """Return numbers in their standard deviations; None if an episode has none, or all noise."""
+    """Return numbers in their standard deviations; None if they differ, or are all noise."""
     if not all(kind in episode.numbers for episode in episodes):
         return None
     numbers = [episode.numbers[kind] for episode in episodes]
+    if len({values.shape[1] for _, values in numbers}) > 1:
+        return None
     deviation = np.concatenate([values for _, values in numbers]).std(0)
     steps = np.concatenate([np.diff(values, axis=0) for _, values in numbers])
     if not len(steps):

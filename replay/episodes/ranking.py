@@ -17,6 +17,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import counted
 from cdmisfa.core.processes import run_all
 from recorder.log.files import locked_folder, make_folder
 from replay.episodes.features import features_of, unlike_columns
@@ -31,6 +32,9 @@ from replay.storage.location import location
 
 # Folder with the measures of each episode, so that the command continues.
 MEASURES: Final = "measured"
+
+# Episodes of a group from which on medians and deviations tell which of them differ.
+COMPARABLE: Final = 10
 
 # Score of an episode that cannot be read, or lacks a camera that the others have.
 UNREADABLE: Final = 100.0
@@ -82,7 +86,9 @@ class Ranked:
         for place in np.argsort(-row, kind="stable")[: (row >= 1).sum()]:
             column = self.columns[place]
             group = next(g for g in self.groups.values() if episode in g)
-            median, at = float(np.nanmedian(column.value[group])), column.at[episode]
+            rest = column.value[group[group != episode]]
+            known, at = rest[np.isfinite(rest)], column.at[episode]
+            median = float(np.median(known)) if len(known) else math.nan
             words = REASONS[column.reason].text(float(column.value[episode]), median)
             camera = f"{column.camera}: " if column.camera and len(cameras) > 1 else ""
             when = "" if math.isnan(at) else f" at {at:.1f} s"
@@ -210,6 +216,11 @@ def compare(logs: list[EpisodeLog], measured: list[Measured], by: str | None = N
             ranked.defects[i] = [f"cannot be read: {one.problem}"]
     whole: dict[tuple[int, str], Column] = {}
     for name, group in ranked.groups.items():
+        if len(group) < COMPARABLE:
+            ranked.notes.append(
+                f"{name or 'dataset'}: a comparison of {counted(len(group), 'episode')} misses "
+                f"faults; it needs {COMPARABLE} or more"
+            )
         _find_swapped(ranked, group)
         for part, column in _columns_of(ranked, name, group):
             empty = (np.full(len(measured), np.nan) for _ in range(3))
@@ -268,7 +279,9 @@ def _columns_of(ranked: Ranked, name: str, group: IntArray) -> Iterator[tuple[In
             yield having, column._replace(camera=camera)
             ranked.lags |= {(int(i), camera): lag for i, lag in zip(having, lags, strict=True)}
             place = f"camera {camera}{f' of {name}' if name else ''}"
-            ranked.notes.append(f"{place}: {_lag_text(whole)}")
+            missed = int(np.isnan(column.value).sum()) if len(lags) > 1 else 0
+            left = f"; not measured in {missed} of {len(lags)} episodes" if missed else ""
+            ranked.notes.append(f"{place}: {_lag_text(whole)}{left}")
 
 
 def _find_swapped(ranked: Ranked, group: IntArray) -> None:
@@ -301,7 +314,7 @@ def _alike(ranked: Ranked, group: IntArray, sizes: Sequence[Any], what: str) -> 
 
 def _lag_text(lag: Lag) -> str:
     if not lag.certain:
-        return "its lag behind the joints cannot be measured: too little moves that both show"
+        return "its lag behind the joints cannot be measured: there is no clear peak"
     side = "behind" if lag.seconds >= 0 else "ahead of"
     return (
         f"{abs(lag.seconds) * 1e3:.0f} ms {side} the joints, +- {lag.error * 1e3:.0f} ms, "

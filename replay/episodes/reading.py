@@ -33,7 +33,7 @@ from replay.storage.location import is_url, location
 from replay.storage.paths import natural_order, no_such
 
 # Increased whenever a measure changes, so that stored ones are not used any more.
-VERSION: Final = 1
+VERSION: Final = 2
 
 # Images between two collections: PyAV's images are freed by the collector only, and each of them is
 # so few objects that it does not run by itself.
@@ -241,7 +241,12 @@ def measure_episode(log: EpisodeLog) -> Measured:
     try:
         if not log.problem:
             with ExitStack() as opened:
-                _measure(open_cameras(log, opened), read_numbers(log, opened), measured)
+                cameras = open_cameras(log, opened)
+                _measure(cameras, read_numbers(log, opened), measured)
+                if log.number < 0:  # of a dataset, a note states it once
+                    read = cameras.values()
+                    cut = [s.missing or (s.reader.missing if s.reader else "") for s in read]
+                    measured.remarks += dict.fromkeys(filter(None, cut))
     except CdmisfaError as error:
         measured.problem = str(error)
     except Exception as error:  # libraries raise anything for a broken file

@@ -23,7 +23,7 @@ class Reason(NamedTuple):
     Attributes:
         limit: distance from the median, in robust standard deviations, from which on it is given.
         least: the smallest robust standard deviation that is believed, in the column's unit.
-        words: how it is stated; {x} is the value, {median} the one of the group.
+        words: how it is stated; {x} is the value, {median} the one of the others.
         form: how the value is written.
         relative: whether a value that many episodes share is normal for them, as another view.
     """
@@ -35,8 +35,9 @@ class Reason(NamedTuple):
     relative: bool = True
 
     def text(self, value: float, median: float) -> str:
-        """Return the reason in words, for a value and the median of the group."""
-        return self.words.format(x=self.form.format(value), median=self.form.format(median))
+        """Return the reason in words, for a value and the median of the others, NaN if unknown."""
+        words = self.words.partition(", the others")[0] if np.isnan(median) else self.words
+        return words.format(x=self.form.format(value), median=self.form.format(median))
 
 
 REASONS: Final = {
@@ -44,12 +45,13 @@ REASONS: Final = {
     "idle": Reason(5, 0.08, "the joints move {x} times as far as in the others", "{:.2f}"),
     "frozen": Reason(5, 0.06, "{x} of motion behind a frozen image", "{:.1f} s", False),
     "repeated": Reason(5, 0.01, "{x} of the images in motion are repeated", "{:.0%}", False),
+    "dropped": Reason(5, 0.06, "{x} of images are missing", "{:.1f} s", False),
     "black": Reason(5, 0.02, "an image is {x} black", "{:.0%}", False),
     "light": Reason(4, 0.02, "brightness off by {x}", "{:+.0%}"),
     "flicker": Reason(5, 0.02, "brightness changes by {x} at once", "{:+.0%}", False),
     "blur": Reason(4, 0.04, "{x} times as sharp as the others", "{:.2f}"),
     "camera": Reason(5, 0.3, "the view is shifted by {x} pixels", "{:.0f}"),
-    "colors": Reason(3, 0.5, "colors that the others lack, or the reverse"),
+    "colors": Reason(4, 0.5, "colors that the others lack, or the reverse"),
     "tint": Reason(4, 0.01, "red or blue off by {x}", "{:+.0%}"),
     "unlike": Reason(4.5, 0.03, "images unlike all other episodes"),
     "covered": Reason(5, 0.04, "something is in view that no other episode has"),
@@ -69,7 +71,7 @@ def scores(
     score = (x - median) / max(1.4826 median |x - median|, least) / limit
 
     The deviation is the larger one of the group and of all groups. If a relative reason holds for
-    more than `SHARED` of a group, episodes are also compared with the median of these.
+    more than `SHARED` of a group, with values alike, these are also compared with their median.
 
     Equation: E19
 
@@ -91,8 +93,9 @@ def scores(
         many = group[score[group] >= 1]
         if reason.relative and len(many) >= max(SHARED * len(group), FEWEST):
             apart = np.abs(x[many] - np.median(x[many])) / unit
-            score[many] = np.minimum(score[many], apart)
-            shared.append((place, many[apart < 1]))
+            if (apart < 1).sum() >= max(SHARED * len(group), FEWEST):
+                score[many] = np.minimum(score[many], apart)
+                shared.append((place, many[apart < 1]))
     return score, shared
 
 
