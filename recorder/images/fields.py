@@ -196,6 +196,34 @@ def field_value(value: Any, name: str) -> Any:
     return value[name] if isinstance(value, Mapping) else getattr(value, name)
 
 
+def joints_of(message: Any) -> list[str]:
+    """Return the names of the joints in a JointState message."""
+    names = field_value(message, "name") if "name" in members(message) else ()
+    return list(map(str, names))
+
+
+def with_joints(where: object, joints: Sequence[str], message: Any) -> Any:
+    """Return a JointState message with its values in the order of `joints`; as `joint_places`."""
+    if (stated := joints_of(message)) == joints:
+        return message
+    places = joint_places(where, joints, stated)
+    values = {name: field_value(message, name) for name in members(message)}
+    for name, value in values.items():
+        if _is_list(value) and len(value) == len(places):
+            values[name] = [value[place] for place in places]
+    return values
+
+
+def joint_places(where: object, joints: Sequence[str], stated: Sequence[str]) -> list[int]:
+    """Return the place of each joint in a list; a UsageError if the list has other joints."""
+    if sorted(joints) != sorted(stated):
+        raise UsageError(
+            f"{where} has the joints {', '.join(stated) or 'without names'} after messages with "
+            f"{', '.join(joints)}: write the joints of each publisher to a topic or log of its own"
+        )
+    return [stated.index(joint) for joint in joints]
+
+
 def _is_list(value: Any) -> bool:
     if isinstance(value, str | bytes | Mapping | np.generic):
         return False

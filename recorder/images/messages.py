@@ -241,12 +241,15 @@ PACKED: Final = frozenset(kind for kind in _CONTENT if kind[0].endswith("Compres
 SCHEMAS: Final = tuple(sorted({schema for schema, _ in _CONTENT}))
 
 
-def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:
+def decoder_of(
+    kind: MessageKind, options: InputOptions, ordered: Callable[[Any], Any] | None = None
+) -> Decoder | None:
     """Return the decoder of the images or the fields of messages, or None.
 
     Args:
         kind: kind of the messages.
         options: the fields to read, or else the range of distances and whether to keep colors.
+        ordered: returns a decoded message with the members of its lists in a fixed order.
 
     Returns:
         A function that returns an image, or numbers (I,) float64. It raises MalformedImage, or
@@ -262,6 +265,7 @@ def decoder_of(kind: MessageKind, options: InputOptions) -> Decoder | None:
 
         def numbers(data: Data) -> Content:
             message = decode(bytes(data))
+            message = ordered(message) if ordered else message
             fields.extend(map(Field, () if fields else number_paths(message)))
             return numbers_of(fields, message, depth)
 

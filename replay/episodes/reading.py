@@ -211,7 +211,9 @@ def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: Exi
             f"{path}: {topic} has a changing number of values: choose a part of "
             f"them, as in --state {topic}:position[0:6]"
         )
-    return stream.seconds()[rows], np.stack(values)
+    # Sorted by the names of joints, columns are the same in all logs, whatever a publisher's order.
+    order = np.argsort(stream.elements()) if stream.elements() else slice(None)
+    return stream.seconds()[rows], np.stack(values)[:, order]
 
 
 def _streams(

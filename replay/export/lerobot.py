@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import ACTION, BEGINS, JOINT, stream_names
+from recorder.images.fields import joint_places
 from recorder.images.options import IMAGES, InputOptions
 from replay.export.frames import image_shape, pieces, pixel_format, shared_spans, write_video
 from replay.export.numbers import ACTIONS, READ, STATE, Columns, Message, log_columns
@@ -94,7 +95,7 @@ def write_dataset(
             number = tasks.setdefault(name, len(tasks))
             columns = _numbers(source, paths, spans, options, warn)
             columns |= _clock(spans, fps, start, len(episodes), number)
-            _refuse_other(features, columns, paths[0])
+            columns = _in_order(features, columns, paths[0])
             features |= {key: _feature(*column) for key, column in columns.items()}
             rows = _rows(columns, spans, start, len(episodes), name)
             for stream, view in enumerate(stream_names(source.spec.streams)):
@@ -142,8 +143,8 @@ def _rows(
     ]
 
 
-def _refuse_other(features: Mapping[str, Mapping[str, Any]], columns: Columns, path: Path) -> None:
-    """Refuse a log with other numbers than the logs before."""
+def _in_order(features: Mapping[str, Mapping[str, Any]], columns: Columns, path: Path) -> Columns:
+    """Return numbers in the order of the logs before; refuse a log with other numbers."""
     for key in features.keys() | columns.keys() if features else ():
         if features.get(key, {}).get("dtype") == "video":
             continue
@@ -154,6 +155,11 @@ def _refuse_other(features: Mapping[str, Mapping[str, Any]], columns: Columns, p
                 f"{path} has {two} for {key}, but the logs before have {one}: choose topics that "
                 "all have with --topic, --state and --action, or export them separately"
             )
+        values, names = columns[key]
+        if names and names != (expected := features[key]["names"]):
+            places = joint_places(path, expected, names)
+            columns[key] = values[:, places] if values.ndim > 1 else values, expected
+    return columns
 
 
 def _whole_rate(source: LoggedSource) -> int:

@@ -94,7 +94,8 @@ def log_columns(
                     why = _reason(error, path, topic)
                     warn(f"{', '.join(fields)} of {topic} is left out: {why}")
                     continue
-                parts.setdefault(key, []).append((topic, values, list(stream.columns())))
+                names = list(stream.elements() or stream.columns())
+                parts.setdefault(key, []).append((topic, values, names))
     if missing:
         raise UsageError(f"{source.streams[0].path} has no numbers on {min(missing)}")
     return {key: _joined(key, parts[key], warn) for key in sorted(parts)}

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
+from recorder.images.fields import joint_places
 from recorder.images.options import RECIPE
 from recorder.images.pixels import Content, MalformedImage
 from recorder.mcap.reader import LogReader
@@ -70,6 +71,7 @@ class LogStream:
         recipe: text that states how an image becomes a frame, stored with runs.
         fields: fields that are read instead of images, in order.
         columns: returns the name of each number of a row.
+        elements: returns the same by the names of joints, as `elbow`; () where none are stated.
         warnings: lines to print for the user.
         notes: lines on topics that are left out.
         remarks: a line for each property that the format cannot guarantee, as without checksums.
@@ -97,6 +99,7 @@ class LogStream:
     recipe: str = RECIPE
     fields: Sequence[str] = ()
     columns: Callable[[], Sequence[str]] = tuple
+    elements: Callable[[], Sequence[str]] = tuple
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     remarks: Sequence[str] = ()
@@ -165,8 +168,22 @@ def check_times(where: object, times: IntArray) -> None:
         raise LogDamagedError(f"{where} has times before 1970 or after 2116")
 
 
+def _in_order(stream: LogStream, elements: Sequence[str]) -> LogStream:
+    """Return a stream with the numbers of its rows in the order of `elements`."""
+    present, decode = list(stream.elements()), stream.decode
+    if present == list(elements):
+        return stream
+    places = joint_places(f"{stream.path}: {stream.topic}", elements, present)
+    return replace(stream, decode=lambda data: decode(data)[places])
+
+
 def joined(parts: Sequence[LogStream]) -> LogStream:
-    """Merge streams with times into one, ordered by time, ties in the order of the streams."""
+    """Merge streams with times into one, ordered by time, ties in the order of the streams.
+
+    Raises:
+        UsageError: they have other joints.
+    """
+    parts = [_in_order(part, parts[0].elements()) for part in parts]
     times = np.concatenate([part.times for part in parts if part.times is not None])
     order = np.argsort(times, kind="stable")
     part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import fnmatch
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.fields import EVERY, column_names, number_paths
+from recorder.images.fields import EVERY, column_names, joints_of, number_paths, with_joints
 from recorder.images.messages import (
     PACKED,
     SCHEMAS,
@@ -29,9 +31,12 @@ from recorder.images.options import NUMBERS_RECIPE, RECIPE, VIDEO_RECIPE, InputO
 from recorder.images.pixels import Content, MalformedImage
 from recorder.images.videos import VideoPackets
 from recorder.mcap.records import MalformedRecord
-from replay.logs.stream import LogStream
+from replay.logs.stream import BROKEN, LogStream, limited
 
 Channel = TypeVar("Channel")
+
+# Columns with one value of each joint.
+_OF_JOINT: Final = re.compile(r"(position|velocity|effort)(?:\[(\d+)\])?$")
 
 
 class NoTopicError(UsageError):
@@ -155,7 +160,9 @@ def message_stream(
         if not options.fields:
             raise UsageError(f"{path}: {topic} has {kind.schema}, with neither images nor numbers")
         warnings.append(f"{path}: {topic} is read as its numbers {', '.join(options.fields)}")
-    decode = decoder_of(kind, options)
+    joints = _joints(path, kind, len(times), fetch) if options.fields else []
+    ordered = partial(with_joints, f"{path}: {topic}", joints) if joints else None
+    decode = decoder_of(kind, options, ordered)
     assert decode is not None
 
     def columns() -> list[str]:
@@ -164,6 +171,10 @@ def message_stream(
             read = decoder_of(kind, replace(options, fields=(field,)))
             numbers += column_names(field, len(read(message))) if read else []
         return numbers
+
+    def named(column: re.Match[str]) -> str:
+        joint = joints[int(column[2] or 0)]
+        return joint if column[1] == "position" else f"{joint}.{column[1]}"
 
     names = kind.schema, kind.encoding
     is_packed = names in PACKED and not options.fields
@@ -181,11 +192,25 @@ def message_stream(
         fields=options.fields,
         warnings=warnings,
         columns=columns,
+        elements=lambda: [_OF_JOINT.sub(named, name) for name in columns()] if joints else (),
         **about,
     )
     if isinstance(decode, VideoPackets):
         stream = _Video(stream, decode).stream()
     return by_stamps(stream) if options.stamp == "header" else stream
+
+
+def _joints(
+    path: Path, kind: MessageKind, count: int, fetch: Callable[[int], Any]
+) -> Sequence[str]:
+    """Return the joints of the first JointState message that is readable; [] without names."""
+    decode = message_decoder(kind) if kind.schema.endswith("JointState") else None
+    for row in range(count if decode else 0):
+        with suppress(*BROKEN), limited(path, "its decoder"):
+            assert decode is not None
+            joints = joints_of(decode(bytes(fetch(row))))
+            return joints if len({*joints}) == len(joints) else []
+    return []
 
 
 def by_stamps(stream: LogStream) -> LogStream:
