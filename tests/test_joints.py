@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -16,14 +16,16 @@ from mcap.writer import Writer
 from message_files import START, STEP
 
 from recorder.images.messages import MessageKind
-from replay.episodes.reading import list_episodes, read_numbers
+from replay.episodes.reading import list_episodes, measure_episode, read_numbers
 
 JOINTS = MessageKind("JointState", "json")
 VALUES = {"elbow": 1.0, "hand": 2.0, "neck": 3.0}
 
 
-def joint_log(path: Path, orders: Iterable[Sequence[str]], start: int = START) -> Path:
-    """Write images and joint states, whose messages name joints in the given orders."""
+def joint_log(
+    path: Path, orders: Iterable[Sequence[str]], start: int = START, lost: Collection[int] = ()
+) -> Path:
+    """Write images and joint states, which name joints in the given orders, or `lost` the first."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -35,7 +37,8 @@ def joint_log(path: Path, orders: Iterable[Sequence[str]], start: int = START) -
             time = start + i * STEP
             image = np.random.default_rng(i).integers(0, 255, (48, 64), np.uint8)
             writer.add_message(camera, time, raw(image), time)
-            values = [VALUES.get(name, 0) for name in names]
+            values: list[float | None] = [VALUES.get(name, 0) for name in names]
+            values[:1] = [None] if i in lost else values[:1]
             message = {"name": names, "position": values, "velocity": values, "effort": []}
             writer.add_message(joints, time, json.dumps(message).encode(), time)
         writer.finish()
@@ -100,3 +103,24 @@ def test_two_publishers_on_a_topic_are_refused_by_their_joints(
         "/joints has the joints left, middle, right after messages with hand, elbow, neck: write "
         "the joints of each publisher to a topic or log of its own"
     ) in refused.err
+
+
+def test_episodes_leave_out_joint_states_that_are_not_finite(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log = joint_log(tmp_path / "a.mcap", [ONE] * 30, lost=range(5, 9))
+    episode = measure_episode(list_episodes([log], tmp_path / "out", {})[0])
+    assert episode.problem == ""
+    assert "4 of 30 rows of the states are not finite: they are left out" in episode.remarks
+    assert episode.numbers["state"][1].tolist() == [[1, 2, 3]] * 26
+
+
+def test_episodes_refuse_an_output_that_holds_the_input(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    joint_log(logs / "a.mcap", [ONE] * 6)
+    for word in (logs, logs / "a.mcap", logs / "*.mcap"):
+        refused = cdmisfa("episodes", word, "-o", logs)
+        assert refused.code == 2
+        assert f"{logs}: it is, or holds, the input {logs}" in refused.err
+    assert [file.name for file in logs.iterdir()] == ["a.mcap"]

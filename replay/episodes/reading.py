@@ -42,6 +42,9 @@ COLLECT_EVERY: Final = 64
 # Formats of logs with topics.
 _WITH_TOPICS: Final = ("mcap", "split", "bag")
 
+# Range of numbers that refuses none: NaN becomes -inf, and `_measure` leaves its row out.
+_ANY: Final = (-np.inf, np.inf)
+
 # Times (N,) in seconds and values (N, n).
 Rows = tuple[FloatArray, FloatArray]
 
@@ -79,6 +82,13 @@ class EpisodeLog:
         """Return a name for measures of this episode, which differs if the log changes."""
         text = json.dumps([VERSION, asdict(self)], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+def refuse_input(words: Sequence[str | Path], out: Path) -> None:
+    """Refuse a folder of results that holds an input; a UsageError."""
+    for path in locations(words):
+        if not is_url(path) and path.resolve().is_relative_to(out.resolve()):
+            raise UsageError(f"{out}: it is, or holds, the input {path}: choose another output")
 
 
 def list_episodes(
@@ -197,8 +207,8 @@ def _numbers(log: EpisodeLog, path: Path, format: Format, word: str, opened: Exi
     if format == "dataset":
         (stream,) = _streams(log, path, format, opened, fields=(word,))
     else:
-        fields = (field or "position",)
-        (stream,) = _streams(log, path, format, opened, topics=(topic,), fields=fields)
+        how = {"topics": (topic,), "fields": (field or "position",), "range": _ANY}
+        (stream,) = _streams(log, path, format, opened, **how)
     if stream.read is not None:
         return stream.seconds(), np.asarray(stream.read(range(stream.count))[0], np.float64)
     rows, values = list[int](), list[Any]()
