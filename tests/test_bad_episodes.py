@@ -296,3 +296,13 @@ def test_few_episodes_and_other_joints_are_compared_with_a_note() -> None:
     ranked = compared([log(0, 0), other])
     assert not ranked.flagged
     assert any("it needs 10 or more" in note for note in ranked.notes)
+
+
+def test_verify_names_a_missing_video_once(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    data = dataset(tmp_path / "data", [""] * 3, video=True)
+    film = data / f"videos/{KEY}/0-1.mp4"
+    film.unlink()
+    done = cdmisfa("verify", data, "--json")
+    assert done.code == 3
+    missing = {"where": str(film), "what": "this file of the dataset is missing"}
+    assert done.json["problems"] == [missing]

@@ -178,3 +178,16 @@ def test_what_is_not_whole_is_named_and_recovered(
     assert pq.read_table(out / "meta/tasks.parquet").to_pylist() == [
         {"task_index": 0, "__index_level_0__": TASK}
     ]
+
+
+def test_lost_frames_are_counted_from_the_tables_if_info_json_lags_behind(
+    cdmisfa: Cdmisfa, recorded: dict[str, Path], tmp_path: Path
+) -> None:
+    data = tmp_path / "data"
+    assert cdmisfa("recover", recorded["v3.0"], "-o", data).code == 3
+    shorter_video(data)
+    states(1)(data)
+    done = cdmisfa("recover", data, "-o", tmp_path / "out", "--json")
+    assert done.code == 3
+    lost = {(c["kept"], c["lost"]) for c in done.json["channels"]}
+    assert lost == {(sum(LENGTHS[:2]), LENGTHS[2])}

@@ -123,7 +123,8 @@ def _recover_dataset(src: Path, dst: Path, force: bool) -> Recovery:
         raise UsageError(f"{dst}: it holds the input, or lies in it; choose another output")
     channels = [channel.info for channel in dataset_channels(src)]
     dataset, lost = write_whole(src, dst)
-    stated, count = int(dataset.info["total_frames"]), len(dataset.times)
+    # A recorder that is killed leaves info.json behind the tables.
+    stated, count = max(int(dataset.info["total_frames"]), dataset.listed), len(dataset.times)
     unread = max(stated - count, 0) if stated > count or not lost else None
     problems = (Problem(str(src), dataset.missing),) if dataset.missing else ()
     return Recovery(

@@ -35,7 +35,7 @@ from replay.logs.open_logs import (
     open_stream,
 )
 from replay.logs.source import LoggedSource
-from replay.logs.stream import check_times, limited
+from replay.logs.stream import MissingFileError, check_times, limited
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
 from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, header_in
 from replay.runs.modules import load_modules
@@ -338,6 +338,7 @@ def _check_external(path: Path) -> LogReport:
 def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ()) -> LogReport:
     """Decode every image on some topics of a camera log; `absent` parts are reported with it."""
     problems: list[Problem] = []
+    files: dict[str, Problem] = {}
     health: dict[str, Health] = {}
     missing = dict.fromkeys(absent)
     notes: dict[str, None] = {}
@@ -346,7 +347,10 @@ def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ())
             with open_stream(path, topic) as stream:
                 measured = health.setdefault(topic, Health())
                 for row, error in broken_rows(stream, measured):
-                    problems.append(Problem(stream.name_of(row), str(error)))
+                    if isinstance(error, MissingFileError):
+                        files[str(error)] = Problem(*str(error).rsplit(": ", 1))
+                    else:
+                        problems.append(Problem(stream.name_of(row), str(error)))
                 missing |= dict.fromkeys([stream.missing] if stream.missing else [])
                 notes |= dict.fromkeys((*stream.remarks, *stream.warnings))
         except LogDamagedError as damage:
@@ -354,6 +358,7 @@ def _check_topics(path: Path, topics: Iterable[str], absent: Iterable[str] = ())
         except UsageError as refusal:  # it needs an option
             reason = str(refusal).removeprefix(f"{path}: ")
             notes[f"{path}: {topic} was not decoded: {reason}"] = None
+    problems += files.values()
     state: State = "damaged" if problems else "cut short" if missing else "whole"
     problems += [Problem(str(path), what) for what in missing]
     remarks = tuple(note for note in notes if note.removeprefix(f"{path}: ") not in missing)

@@ -57,7 +57,8 @@ def write_whole(src: Path, dst: Path) -> tuple[lerobot.Dataset, bool]:
         whole |= {"splits": {"train": f"0:{len(rows)}"}}
         whole |= {"total_videos": len(videos)} if "total_videos" in info else {}
         (out / lerobot.INFO).write_text(json.dumps(whole, indent=4), "utf-8")
-    return dataset, int(info["total_frames"]) > len(dataset.times) or counts != frames
+    listed = max(int(info["total_frames"]), dataset.listed)
+    return dataset, listed > len(dataset.times) or counts != frames
 
 
 def _read(file: Path) -> Any:

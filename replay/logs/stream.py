@@ -36,6 +36,10 @@ class UnreadableError(LogDamagedError):
     """A library cannot read a file."""
 
 
+class MissingFileError(LogDamagedError):
+    """A file of a dataset is missing."""
+
+
 class NothingLoggedError(LogDamagedError):
     """The log was cut before its first message."""
 

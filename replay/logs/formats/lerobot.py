@@ -26,7 +26,14 @@ from replay.logs.formats import lerobot_layout as layout
 from replay.logs.formats.messages import NoTopicError, check_topics, fits_topic, left_out
 from replay.logs.formats.table import number_stream
 from replay.logs.formats.video import VideoFile
-from replay.logs.stream import ChannelInfo, ExternalChannel, LogStream, explained, limited
+from replay.logs.stream import (
+    ChannelInfo,
+    ExternalChannel,
+    LogStream,
+    MissingFileError,
+    explained,
+    limited,
+)
 from replay.stored_source import PAUSE
 
 INFO: Final = "meta/info.json"
@@ -50,13 +57,14 @@ class Dataset:
         info: description in meta/info.json.
         rows: rows of the tables of episodes, up to the last whole one.
         missing: why further episodes are not read, or "".
+        listed: frames of all episodes in the tables, whole or not.
         starts: the first frame of each episode, and the end of the last.
         times: time of each frame in nanoseconds.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.info = path, _info(path)
-        self.rows, self.missing = _episodes(path, self.info)
+        self.rows, self.missing, self.listed = _episodes(path, self.info)
         with limited(path, LAYOUT):
             lengths = np.array([int(row["length"]) for row in self.rows], np.int64)
             self.starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -148,7 +156,7 @@ class _Camera:
         if self._file != file:
             self.close()
             if not file.is_file():
-                raise LogDamagedError(f"{file}: this file of the dataset is missing")
+                raise MissingFileError(f"{file}: this file of the dataset is missing")
             self._images = self._table(file) if not self.video else VideoFile(file, self._color)
             self._file = file
         if not self.video:
@@ -282,8 +290,8 @@ def _info(path: Path) -> Any:
         return info
 
 
-def _episodes(path: Path, info: Any) -> tuple[list[dict[str, Any]], str]:
-    """Return what the tables state about episodes, in their order, and a message about the rest."""
+def _episodes(path: Path, info: Any) -> tuple[list[dict[str, Any]], str, int]:
+    """Return the rows of whole episodes in order, a message about others, and all their frames."""
     import pyarrow.parquet as pq
 
     damage, rows = list[str](), list[dict[str, Any]]()
@@ -302,7 +310,8 @@ def _episodes(path: Path, info: Any) -> tuple[list[dict[str, Any]], str]:
                 rows += parquet.read(columns=names, use_threads=False).to_pylist()
     with explained(path, LAYOUT):
         rows.sort(key=lambda row: int(row["episode_index"]))
-        return layout.whole_episodes(path, info, rows, damage)
+        listed = sum(int(row["length"]) for row in rows)
+        return *layout.whole_episodes(path, info, rows, damage), listed
 
 
 def tables(path: Path, folder: str = "data") -> list[Path]:
