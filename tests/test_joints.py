@@ -14,6 +14,7 @@ from camera_files import RAW, raw
 from conftest import Cdmisfa
 from mcap.writer import Writer
 from message_files import START, STEP
+from test_bad_episodes import COUNT, dataset
 
 from recorder.images.messages import MessageKind
 from replay.episodes.reading import list_episodes, measure_episode, read_numbers
@@ -124,3 +125,23 @@ def test_episodes_refuse_an_output_that_holds_the_input(cdmisfa: Cdmisfa, tmp_pa
         assert refused.code == 2
         assert f"{logs}: it is, or holds, the input {logs}" in refused.err
     assert [file.name for file in logs.iterdir()] == ["a.mcap"]
+
+
+@pytest.mark.parametrize("names", [["x", "y"], {"motors": ["x", "y"]}])
+def test_a_dataset_keeps_its_tasks_and_the_names_of_its_elements(
+    cdmisfa: Cdmisfa, tmp_path: Path, names: object
+) -> None:
+    data = dataset(tmp_path / "data", [""] * 3, tasks=["push", "pull", "push"])
+    info = json.loads((data / "meta/info.json").read_text())
+    info["features"]["observation.state"]["names"] = names
+    (data / "meta/info.json").write_text(json.dumps(info))
+    done = cdmisfa("export", data, "--to", "lerobot", "-o", tmp_path / "out")
+    assert done.code == 0, done.err
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert info["features"]["observation.state"]["names"] == ["x", "y"]
+    episodes = pq.read_table(tmp_path / "out/meta/episodes")
+    assert episodes["tasks"].to_pylist() == [["push"], ["pull"], ["push"]]
+    tasks = pq.read_table(tmp_path / "out/meta/tasks.parquet").to_pydict()
+    assert tasks == {"task_index": [0, 1], "__index_level_0__": ["push", "pull"]}
+    numbers = pq.read_table(tmp_path / "out/data")["task_index"].to_pylist()
+    assert numbers == [0] * COUNT + [1] * COUNT + [0] * COUNT

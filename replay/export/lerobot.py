@@ -26,6 +26,8 @@ from recorder.images.fields import joint_places
 from recorder.images.options import IMAGES, InputOptions
 from replay.export.frames import image_shape, pieces, pixel_format, shared_spans, write_video
 from replay.export.numbers import ACTIONS, READ, STATE, Columns, Message, log_columns
+from replay.logs.clock import nearest_rows
+from replay.logs.formats import lerobot
 from replay.logs.formats import lerobot_layout as layout
 from replay.logs.open_logs import log_format
 from replay.logs.source import LoggedSource
@@ -91,13 +93,13 @@ def write_dataset(
         table: pq.ParquetWriter | None = None
         for log, (paths, source) in enumerate(logs):
             fps, spans = _whole_rate(source), _episodes(source)
-            name = options.task or _task(source)
-            number = tasks.setdefault(name, len(tasks))
+            named = [options.task] * len(spans) if options.task else _tasks(source, spans)
+            of_spans = [tasks.setdefault(name, len(tasks)) for name in named]
             columns = _numbers(source, paths, spans, options, warn)
-            columns |= _clock(spans, fps, start, len(episodes), number)
+            columns |= _clock(spans, fps, start, len(episodes), of_spans)
             columns = _in_order(features, columns, paths[0])
             features |= {key: _feature(*column) for key, column in columns.items()}
-            rows = _rows(columns, spans, start, len(episodes), name)
+            rows = _rows(columns, spans, start, len(episodes), named)
             for stream, view in enumerate(stream_names(source.spec.streams)):
                 if len(source.spec.kind(stream)[0]) > 1:
                     key = f"observation.images.{view}"
@@ -125,14 +127,14 @@ def write_dataset(
 
 
 def _rows(
-    columns: Columns, spans: Sequence[Span], start: int, first: int, task: str
+    columns: Columns, spans: Sequence[Span], start: int, first: int, tasks: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return the rows of the table of episodes, without their videos."""
     ends = itertools.accumulate((high - low for low, high in spans), initial=0)
     return [
         {
             "episode_index": first + i,
-            "tasks": [task],
+            "tasks": [tasks[i]],
             "length": end - begin,
             **_file_number("data", 0),
             "dataset_from_index": start + begin,
@@ -171,6 +173,19 @@ def _whole_rate(source: LoggedSource) -> int:
             f"--rate {rate}, which shows the image nearest to each time"
         )
     return round(fps)
+
+
+def _tasks(source: LoggedSource, spans: Sequence[Span]) -> list[str]:
+    """Return the task of each span: as a dataset or a recording states it, or else the scene."""
+    if log_format(path := source.streams[0].path) == "dataset":
+        dataset = lerobot.Dataset(path)
+        starts = np.array([source.spec.times(*span)[0] for span in spans])
+        frames = nearest_rows(dataset.times, starts)
+        episodes = np.searchsorted(dataset.starts, frames, side="right") - 1
+        return [
+            " and ".join(map(str, dataset.rows[i].get("tasks") or ["unknown"])) for i in episodes
+        ]
+    return [_task(source)] * len(spans)
 
 
 def _task(source: LoggedSource) -> str:
@@ -230,7 +245,9 @@ def _numbers(
     }
 
 
-def _clock(spans: Sequence[Span], fps: int, start: int, episode: int, task: int) -> Columns:
+def _clock(
+    spans: Sequence[Span], fps: int, start: int, episode: int, tasks: Sequence[int]
+) -> Columns:
     """Return the columns that number frames, episodes and tasks."""
     lengths = [high - low for low, high in spans]
     within = np.concatenate([np.arange(length) for length in lengths])
@@ -239,7 +256,7 @@ def _clock(spans: Sequence[Span], fps: int, start: int, episode: int, task: int)
         "frame_index": within,
         "episode_index": episode + np.repeat(np.arange(len(spans)), lengths),
         "index": start + np.arange(len(within)),
-        "task_index": np.full(len(within), task),
+        "task_index": np.repeat(tasks, lengths),
     }
     return {key: (values, None) for key, values in columns.items()}
 

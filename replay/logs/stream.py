@@ -175,7 +175,7 @@ def check_times(where: object, times: IntArray) -> None:
 def _in_order(stream: LogStream, elements: Sequence[str]) -> LogStream:
     """Return a stream with the numbers of its rows in the order of `elements`."""
     present, decode = list(stream.elements()), stream.decode
-    if present == list(elements):
+    if not (present and elements) or present == list(elements):
         return stream
     places = joint_places(f"{stream.path}: {stream.topic}", elements, present)
     return replace(stream, decode=lambda data: decode(data)[places])

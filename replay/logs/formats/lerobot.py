@@ -215,8 +215,19 @@ def _numbers(
     columns = [column for name in names for column in column_names(name, widths[name])]
     warnings = [*stream.warnings, *dataset.notes(what)]
     missing = dataset.missing
+    stated = dataset.info["features"][names[0]].get("names")
+    if isinstance(stated, Mapping):  # {"motors": [...]}
+        stated = next(iter(stated.values()), None)
+    whole = (
+        isinstance(stated, list) and len(names) == 1 and len({*map(str, stated)}) == len(columns)
+    )
     return replace(
-        stream, fields=names, columns=lambda: columns, warnings=warnings, missing=missing
+        stream,
+        fields=names,
+        columns=lambda: columns,
+        elements=lambda: list(map(str, stated)) if whole else (),
+        warnings=warnings,
+        missing=missing,
     )
 
 
