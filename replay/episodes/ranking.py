@@ -176,19 +176,20 @@ def rank_episodes(
         done = len(files) - len(missing)
         progress(done, len(files))
         tasks = [(logs[i], files[i]) for i in missing]
-        for place, one in run_all(_measured, tasks, jobs=jobs):
-            measured[missing[place]] = one
+        for _ in run_all(_measure, tasks, jobs=jobs):
             done += 1
             progress(done, len(files))
             if stop() and done < len(files):
                 return None
+        # Only now: while workers measure, this process needs little memory.
+        measured |= {i: load_measures(files[i]) for i in missing}
     episodes = [one for one in measured.values() if one is not None]
     if all(one.problem for one in episodes):
         raise UsageError(episodes[0].problem)
     return compare(logs, episodes, by)
 
 
-def _measured(task: tuple[EpisodeLog, Path]) -> Measured:
+def _measure(task: tuple[EpisodeLog, Path]) -> None:
     """Measure an episode, and store the measures."""
     # glibc maps memory of more than 128 KiB anew for each array, which takes as long as decoding,
     # until an array is freed that was larger, of at most 32 MiB.
@@ -201,7 +202,6 @@ def _measured(task: tuple[EpisodeLog, Path]) -> Measured:
     # glibc does not reuse all memory of closed videos: 50 MB remain of each.
     with suppress(AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
-    return measured
 
 
 def compare(logs: list[EpisodeLog], measured: list[Measured], by: str | None = None) -> Ranked:
