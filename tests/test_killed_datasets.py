@@ -191,3 +191,40 @@ def test_lost_frames_are_counted_from_the_tables_if_info_json_lags_behind(
     assert done.code == 3
     lost = {(c["kept"], c["lost"]) for c in done.json["channels"]}
     assert lost == {(sum(LENGTHS[:2]), LENGTHS[2])}
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_episodes_around_a_missing_file_are_recovered_with_new_numbers(
+    cdmisfa: Cdmisfa, recorded: dict[str, Path], tmp_path: Path, version: str
+) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    assert cdmisfa("recover", recorded[version], "-o", data).code == 3
+    file = data / f"videos/{KEY}/chunk-000/file-001.mp4"
+    if version == "v2.1":
+        file = next((data / "videos").rglob("episode_000001.mp4"))
+        file.unlink()
+    else:  # the video of the second episode is a file of its own
+        table = pq.read_table(data / EPISODES).to_pylist()
+        table[1][f"videos/{KEY}/file_index"] = 1
+        pq.write_table(pa.Table.from_pylist(table), data / EPISODES)
+    done = cdmisfa("recover", data, "-o", out, "--json")
+    assert done.code == 3
+    missing = {"where": str(file), "what": "this file of the dataset is missing"}
+    assert done.json["lost"] == [missing]
+    frames = [*range(LENGTHS[0]), *range(sum(LENGTHS[:2]), sum(LENGTHS[:3]))]
+    counts = {(c["kept"], c["lost"]) for c in done.json["channels"]}
+    assert counts == {(len(frames), LENGTHS[1])}
+    checked = cdmisfa("verify", out, "--json")
+    assert (checked.code, checked.json["problems"]) == (0, [])
+    tables = [pq.read_table(path) for path in sorted((out / "data").rglob("*.parquet"))]
+    rows = [row for table in tables for row in table.to_pylist()]
+    assert [row[STATE][0] for row in rows] == frames
+    assert [row["index"] for row in rows] == [*range(len(frames))]
+    episodes = [0] * LENGTHS[0] + [1] * LENGTHS[2]
+    assert [row["episode_index"] for row in rows] == episodes
+    with external(out, fields=[STATE]) as source:
+        blocks = source.take_all(len(frames) + PAUSE)
+        read = np.concatenate([block.frames for block in blocks])[:, 0]
+        np.testing.assert_array_equal(read, frames)
+    info = json.loads((out / INFO).read_text())
+    assert (info["total_episodes"], info["total_frames"]) == (2, len(frames))

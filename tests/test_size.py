@@ -32,7 +32,7 @@ CEILINGS = {
     "replay/corpus": 740,
     "replay/episodes": 1230,
     "replay/export": 999,
-    "replay/integrity": 1121,
+    "replay/integrity": 1165,
     "replay/logs": 3082,
     "replay/report": 960,
     "replay/runs": 1410,

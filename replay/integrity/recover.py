@@ -122,19 +122,20 @@ def _recover_dataset(src: Path, dst: Path, force: bool) -> Recovery:
     if places[0].is_relative_to(places[1]) or places[1].is_relative_to(places[0]):
         raise UsageError(f"{dst}: it holds the input, or lies in it; choose another output")
     channels = [channel.info for channel in dataset_channels(src)]
-    dataset, lost = write_whole(src, dst)
+    dataset, count, absent, lost = write_whole(src, dst)
     # A recorder that is killed leaves info.json behind the tables.
-    stated, count = max(int(dataset.info["total_frames"]), dataset.listed), len(dataset.times)
+    stated = max(int(dataset.info["total_frames"]), dataset.listed)
     unread = max(stated - count, 0) if stated > count or not lost else None
-    problems = (Problem(str(src), dataset.missing),) if dataset.missing else ()
+    problems = [Problem(str(src / name), "this file of the dataset is missing") for name in absent]
+    problems += [Problem(str(src), dataset.missing)] if dataset.missing else []
     return Recovery(
         str(dst),
         tuple(
             ChannelRecovery(c.topic, count, unread, c.start_ns, c.end_ns, dst.name)
             for c in channels
         ),
-        problems if lost else (),
-        () if lost else problems,
+        tuple(problems if lost else ()),
+        tuple(() if lost else problems),
         0,
     )
 
