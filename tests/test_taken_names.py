@@ -134,7 +134,7 @@ def test_a_run_and_a_recording_do_not_share_a_folder(
 @pytest.mark.parametrize(
     ("words", "leftover"),
     [
-        ("record oscillatory --frames 20", "recording.json.4711.partial"),
+        ("record oscillatory --frames 20", "recording.json.4194305.partial"),
         ("learn oscillatory --max-iterations 2 --no-rerun", "run.mcap.partial"),
     ],
 )
