@@ -36,7 +36,7 @@ VAGUE_NAME = re.compile(
     r"|asked|held|kept|shown|found|there|heard)(?:_|$)"
 )
 CEILINGS = {"strings": 42, "names": 26, "documents": 8}
-WORDS_OF_DOCUMENTS = 25_080
+WORDS_OF_DOCUMENTS = 25_480
 
 # Words that texts for users do not use, and the words that they use instead.
 INSTEAD = {
