@@ -134,12 +134,12 @@ def source_changes(frames: FrameSource) -> None:
         )
 
 
-# Results of runs
-
-
 def _unit(frames: FrameSource) -> str:
     images = all(dtype == "uint8" for _, dtype in frames.spec.every_kind)
     return "images" if images else "messages"
+
+
+# Results of runs
 
 
 def result(run: RunResult, about: Mapping[str, Any] | None) -> None:

@@ -19,7 +19,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.names import stream_name
 from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.apply import Application, Totals, follow
-from cdmisfa.experiments.documents import plain, warnings_of, write_json, writing
+from cdmisfa.experiments.documents import plain, warnings_of, write_json
 from cdmisfa.experiments.store import (
     FAILED,
     ROWS,
@@ -37,6 +37,7 @@ from recorder.log.files import (
     relative_path,
     resolved_path,
     to_disk,
+    writing,
 )
 from replay.corpus.index import IndexedLog, index_logs, indexed_logs, is_index
 from replay.export.applied import AppliedSink, written

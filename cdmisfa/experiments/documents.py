@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from recorder.log.files import atomic_write
-from recorder.log.files import writing as writing
 
 # Packages whose version can change a result.
 PACKAGES = ("cdmisfa", "numpy", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")

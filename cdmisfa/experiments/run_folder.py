@@ -16,7 +16,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.outcomes import EXHAUSTED
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.experiments.documents import machine, plain, write_json, writing
+from cdmisfa.experiments.documents import machine, plain, write_json
 from cdmisfa.experiments.sources import PASSES, open_logs
 from cdmisfa.modules import Module
 from recorder.cameras.words import is_live
@@ -33,6 +33,7 @@ from recorder.log.files import (
     refuse_special,
     relative_path,
     resolved_path,
+    writing,
 )
 from recorder.world.scenes import SCENES, open_scene
 from replay.runs.folders import MODULES_FILE, REPORT_FILE, RUN_FILE, RUN_JSON, VIEW_FILE

@@ -21,13 +21,13 @@ from typing import Any
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import run_all
 from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
-from cdmisfa.experiments.documents import writing
 from recorder.log.files import (
     locked_folder,
     make_folder,
     refuse_named_as_file,
     refuse_special,
     to_disk,
+    writing,
 )
 
 # Name of the file with the rows.

@@ -26,7 +26,7 @@ from replay.episodes.images import columns_of_images
 from replay.episodes.lag import Lag, lag_column
 from replay.episodes.measure import Measured, load_measures, save_measures
 from replay.episodes.numbers import Column, number_columns
-from replay.episodes.reading import EpisodeLog, list_episodes, measure_episode
+from replay.episodes.reading import EpisodeLog, list_episodes, measure_episode, refuse_input
 from replay.episodes.reasons import REASONS, scores
 from replay.storage.location import location
 
@@ -161,9 +161,10 @@ def rank_episodes(
         The episodes; None if it was stopped before all were measured.
 
     Raises:
-        UsageError: there is no episode, no such column, or no episode can be read.
+        UsageError: there is no episode, no such column, no episode can be read, or `out` holds one.
         LogDamagedError: the tables of a LeRobot dataset cannot be read.
     """
+    refuse_input(words, out)
     folder = out / MEASURES
     make_folder(folder)
     with locked_folder(out):

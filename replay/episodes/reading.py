@@ -256,8 +256,7 @@ def measure_episode(log: EpisodeLog) -> Measured:
                 cameras = open_cameras(log, opened)
                 _measure(cameras, read_numbers(log, opened), measured)
                 if log.number < 0:  # of a dataset, a note states it once
-                    read = cameras.values()
-                    cut = [s.missing or (s.reader.missing if s.reader else "") for s in read]
+                    cut = (stream.missing for stream in cameras.values())
                     measured.remarks += dict.fromkeys(filter(None, cut))
     except CdmisfaError as error:
         measured.problem = str(error)

@@ -91,11 +91,12 @@ def scores(
         unit = max(_deviation(score[group]), pooled, reason.least) * reason.limit * size
         score[group] /= unit
         many = group[score[group] >= 1]
-        if reason.relative and len(many) >= max(SHARED * len(group), FEWEST):
-            apart = np.abs(x[many] - np.median(x[many])) / unit
-            if (apart < 1).sum() >= max(SHARED * len(group), FEWEST):
-                score[many] = np.minimum(score[many], apart)
-                shared.append((place, many[apart < 1]))
+        if not (reason.relative and len(many)):
+            continue
+        apart = np.abs(x[many] - np.median(x[many])) / unit
+        if (apart < 1).sum() >= max(SHARED * len(group), FEWEST):
+            score[many] = np.minimum(score[many], apart)
+            shared.append((place, many[apart < 1]))
     return score, shared
 
 

@@ -44,7 +44,7 @@ def write_whole(src: Path, dst: Path) -> tuple[lerobot.Dataset, int, list[str], 
         raise LogDamagedError(f"{src}: no episode is whole: {absent[0]} is missing")
     numbers = {int(row["episode_index"]): number for number, row in enumerate(rows)}
     starts = np.cumsum([0, *(int(row["length"]) for row in rows)])
-    moved = _moved(info, rows, ("", *cameras)) if (src / lerobot.V21).is_file() else {}
+    moved = _moved(info, rows, ("", *cameras)) if (src / layout.V21).is_file() else {}
     frames = layout.table_frames(info, rows)
     videos = {layout.episode_file(info, row, camera) for camera in cameras for row in rows}
     # Not images/ and folders of videos that are being encoded: their episodes were not saved.
@@ -60,14 +60,14 @@ def write_whole(src: Path, dst: Path) -> tuple[lerobot.Dataset, int, list[str], 
                 shutil.copyfile(src / name, target)
             else:
                 pq.write_table(_read(src / name).slice(0, frames[name]), target)
-        for name in (lerobot.V21, lerobot.V21.replace("episodes", "episodes_stats")):
+        for name in (layout.V21, layout.V21.replace("episodes", "episodes_stats")):
             if (src / name).is_file():
                 lines = lerobot.json_lines(src / name, [])
                 chosen = [line for line in lines if line["episode_index"] in numbers]
                 for line in chosen:
                     line["episode_index"] = numbers[line["episode_index"]]
                 (out / name).write_text("\n".join([*map(json.dumps, chosen), ""]), "utf-8")
-        if not (src / lerobot.V21).is_file():
+        if not (src / layout.V21).is_file():
             _write_episodes(src, out, numbers, starts)
             if layout.table_rows(src / _TASKS) is None:
                 pq.write_table(layout.table_of_tasks(_tasks(dataset)), out / _TASKS)
@@ -86,9 +86,8 @@ def _moved(
     names = {}
     for number, row in enumerate(rows):
         for camera in cameras:
-            kind = f"videos/{camera}" if camera else "data"
-            place = {f"{kind}/chunk_index": number // int(info["chunks_size"])}
-            new = {**row, **place, f"{kind}/file_index": number}
+            chunk = number // int(info["chunks_size"])
+            new = {**row, **layout.file_columns(camera, chunk, number)}
             names[layout.episode_file(info, row, camera)] = layout.episode_file(info, new, camera)
     return names
 

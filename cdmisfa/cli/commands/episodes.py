@@ -66,10 +66,8 @@ def episodes_command(
         cdmisfa episodes takes -o check --state /arm/joints --action /arm/cmd
     """
     from replay.episodes.ranking import rank_episodes
-    from replay.episodes.reading import refuse_input
     from replay.episodes.results import PAGE, TABLE, write_ranking
 
-    refuse_input(dataset, output)
     with bar("measuring", "episodes") as progress_bar, stoppable() as stop:
         ranked = rank_episodes(
             dataset,

@@ -41,9 +41,6 @@ INFO: Final = "meta/info.json"
 # Name of the layout in errors.
 LAYOUT: Final = "LeRobot's layout"
 
-# Table of episodes of layout v2.1.
-V21: Final = "meta/episodes.jsonl"
-
 _IMAGES: Final = ("video", "image")
 
 # Features that number the frames.
@@ -306,7 +303,7 @@ def _episodes(path: Path, info: Any) -> tuple[list[dict[str, Any]], str, int]:
     import pyarrow.parquet as pq
 
     damage, rows = list[str](), list[dict[str, Any]]()
-    if (path / V21).is_file():
+    if (path / layout.V21).is_file():
         rows = _v21_episodes(path, info, damage)
     elif not (files := tables(path, "meta/episodes")):
         damage.append("the tables of episodes (meta/episodes/*.parquet) are missing")
@@ -333,16 +330,16 @@ def tables(path: Path, folder: str = "data") -> list[Path]:
 def _v21_episodes(path: Path, info: Any, damage: list[str]) -> list[dict[str, Any]]:
     """Return the episodes of layout v2.1, with the columns that v3.0 has for their files."""
     start, cameras = 0, features(path)[1]
-    with explained(path / V21, LAYOUT):
-        rows = json_lines(path / V21, damage)
+    with explained(path / layout.V21, LAYOUT):
+        rows = json_lines(path / layout.V21, damage)
         rows.sort(key=lambda row: int(row["episode_index"]))
         for row in rows:
             number = int(row["episode_index"])
             chunk = number // int(info["chunks_size"])
-            row["data/chunk_index"], row["data/file_index"] = chunk, number
+            row |= layout.file_columns("", chunk, number)
             row["dataset_from_index"], start = start, start + int(row["length"])
             for key in cameras:
-                row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"] = chunk, number
+                row |= layout.file_columns(key, chunk, number)
                 row[f"videos/{key}/from_timestamp"] = 0.0
     return rows
 

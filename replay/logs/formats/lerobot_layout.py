@@ -32,15 +32,19 @@ NO_FOOTER = "is missing or has no footer, so its rows are lost"
 
 Stats = dict[str, NDArray[Any]]
 
+# Table of episodes of layout v2.1.
+V21 = "meta/episodes.jsonl"
+
 # Pixels of the longer side of an image that its statistics count, as in LeRobot.
 SAMPLED = 150
 
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
-def _columns(camera: str) -> list[str]:
+def file_columns(camera: str, chunk: int = 0, number: int = 0) -> dict[str, int]:
+    """Return the columns that state the table of an episode, or its video of a camera."""
     kind = f"videos/{camera}" if camera else "data"
-    return [f"{kind}/chunk_index", f"{kind}/file_index"]
+    return {f"{kind}/chunk_index": chunk, f"{kind}/file_index": number}
 
 
 def video_cameras(info: Mapping[str, Any]) -> list[str]:
@@ -50,7 +54,7 @@ def video_cameras(info: Mapping[str, Any]) -> list[str]:
 
 def episode_file(info: Mapping[str, Any], row: Mapping[str, Any], camera: str = "") -> str:
     """Return the file in a dataset with the frames of an episode, or with its video of a camera."""
-    chunk, number = (int(row[column]) for column in _columns(camera))
+    chunk, number = (int(row[column]) for column in file_columns(camera))
     template = info["video_path" if camera else "data_path"]
     v21 = {"episode_chunk": chunk, "episode_index": number}
     return str(template.format(video_key=camera, chunk_index=chunk, file_index=number, **v21))
@@ -131,7 +135,7 @@ def _damage_of(
         return f"{name} has {count} of {frames[name]} frames"
     for camera in video_cameras(info):
         start = row.get(f"videos/{camera}/from_timestamp")
-        if start is None or None in (row.get(column) for column in _columns(camera)):
+        if start is None or None in (row.get(column) for column in file_columns(camera)):
             return f"no video of {camera} is listed for episode {row['episode_index']}"
         name = episode_file(info, row, camera)
         if not (path / name).is_file():
@@ -170,7 +174,7 @@ def _further_damage(
             unlisted = count - listed.get(name, 0)
             yield f"{name} has {unlisted} frames of episodes that meta/episodes does not list"
     tasks = path / "meta/tasks.parquet"
-    v3 = not (path / "meta/episodes.jsonl").is_file()
+    v3 = not (path / V21).is_file()
     if v3 and info.get("total_tasks") and table_rows(tasks) is None:
         yield f"meta/tasks.parquet {NO_FOOTER}"
 

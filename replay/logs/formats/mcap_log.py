@@ -68,6 +68,7 @@ def streams(
             memory_bytes=messages.memory_bytes,
             reader=None if path.is_dir() else readers[0],
             notes=notes,
+            missing="; ".join(reader.missing for reader in readers if reader.missing),
             warnings=[*joined, *skipped, *(w for reader in readers for w in reader.warnings)],
         )
         opened_streams.append(stream)
